@@ -1,0 +1,1 @@
+"""echospline: real-time simulation of ultrasound image deformation under a needle."""

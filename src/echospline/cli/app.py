@@ -1,0 +1,32 @@
+"""The Typer application; every command lives in a file of its own and is registered here."""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from echospline.errors import EchosplineError
+
+app = typer.Typer(
+    name="echospline",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+    help="Simulate, in real time, how an ultrasound image deforms while a needle is pushed into the tissue.",
+)
+
+
+@app.callback()
+def _main() -> None:
+    pass
+
+
+def main() -> None:
+    """Run the command line; bad input ends with one sentence on stderr and exit code 2."""
+    try:
+        app()
+    except EchosplineError as error:
+        print(f"echospline: {error}", file=sys.stderr)
+        raise SystemExit(2) from error

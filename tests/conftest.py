@@ -1,0 +1,17 @@
+"""What several test files share: where the real recordings are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+SHARED = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
+
+
+@pytest.fixture(scope="session")
+def recordings() -> Path:
+    """Folder of real ultrasound beside the checkout; the tests that need it say so when it is missing."""
+    if not SHARED.is_dir():
+        pytest.skip(f"real recordings are not at {SHARED}: this test needs them")
+    return SHARED
