@@ -1,0 +1,202 @@
+"""Landmark splines: fit displacements at landmarks, evaluate them anywhere; equations (2) to (9), Algorithm 1.
+
+The system matrix L (6) depends on the landmarks alone: `factor` once, `FactoredSpline.solve` per step. The spline
+carries *displacements*. Equation (9) carries positions; the two agree, because the side conditions reproduce the
+affine motions, the identity among them. Nothing here knows a needle.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.linalg import lu_factor, lu_solve
+from scipy.spatial import cKDTree
+
+from echospline.errors import InputError, SolverError
+from echospline.grid import Floats, as_points
+from echospline.mechanics.kernels import Kernel
+
+RESIDUAL = 1e-7
+"""mm; largest misfit at the landmarks, relative to displacements of 1 mm, before a solution is refused."""
+
+
+@dataclass(frozen=True)
+class Spline:
+    """A fitted field.
+
+    Parameters
+    ----------
+    kernel : Kernel
+        In conditioned coordinates (x - centre) / scale.
+    landmarks : ndarray, shape (m, 2)
+        mm.
+    weights : ndarray, shape (m c, 2 / c)
+        w_i of equation (7), for the conditioned kernel.
+    motion : ndarray, shape (p, 2 / c)
+        Coefficients a_0, a_1, a_2 of the affine (or rigid) part, conditioned.
+    centre : ndarray, shape (2,)
+        mm.
+    scale : float
+        mm.
+    """
+
+    kernel: Kernel
+    landmarks: Floats
+    weights: Floats
+    motion: Floats
+    centre: Floats
+    scale: float
+
+    def __call__(self, points: ArrayLike) -> Floats:
+        """Displacement at points (n, 2) in mm, equation (9) less the identity, shape (n, 2) mm."""
+        x, s = self._conditioned(points), self._conditioned(self.landmarks)
+        field = self.kernel.matrix(x, s) @ self.weights + self.kernel.polynomial(x) @ self.motion
+        return _as_vectors(field, self.kernel.components)
+
+    def gradient(self, points: ArrayLike) -> Floats:
+        """Displacement gradient du_i/dx_j at points (n, 2) in mm, shape (n, 2, 2)."""
+        x, s = self._conditioned(points), self._conditioned(self.landmarks)
+        by = self.kernel.gradient(x, s) @ self.weights + self.kernel.polynomial_gradient(x) @ self.motion
+        columns = [_as_vectors(by[j], self.kernel.components) for j in (0, 1)]
+        gradient: Floats = np.stack(columns, axis=-1) / self.scale
+        return gradient
+
+    def energy(self) -> float:
+        """Bending energy (1) (thin plate, per 16 pi, in conditioned units) or elastic energy: w' K w."""
+        s = self._conditioned(self.landmarks)
+        return float(np.sum(self.weights * (self.kernel.matrix(s, s) @ self.weights)))
+
+    def _conditioned(self, points: ArrayLike) -> Floats:
+        conditioned: Floats = (np.asarray(points, dtype=np.float64).reshape(-1, 2) - self.centre) / self.scale
+        return conditioned
+
+
+@dataclass(frozen=True)
+class FactoredSpline:
+    """The factors of L (6) for one set of landmarks; `solve` costs two triangular solves."""
+
+    kernel: Kernel
+    landmarks: Floats
+    centre: Floats
+    scale: float
+    system: Floats
+    factors: Any
+
+    def solve(self, displacements: ArrayLike) -> Spline:
+        """Fit displacements at the landmarks, equations (7) and (8).
+
+        Parameters
+        ----------
+        displacements : array_like, shape (m, 2)
+            Target minus source of each landmark, mm.
+
+        Returns
+        -------
+        Spline
+
+        Raises
+        ------
+        InputError
+            If the shape is another or a number is not finite.
+        SolverError
+            If the landmarks lie so that L cannot be solved to `RESIDUAL`.
+        """
+        d = as_points(displacements, "displacements")
+        m, c = len(self.landmarks), self.kernel.components
+        if len(d) != m:
+            raise InputError(
+                f"one displacement per landmark is needed: {m} landmarks, {len(d)} displacements"
+            )
+        V = np.vstack([_as_blocks(d, c), np.zeros((len(self.system) - m * c, 2 // c))])
+        solution = lu_solve(self.factors, V, check_finite=False)
+        misfit = float(np.abs(self.system @ solution - V).max())
+        if not misfit <= RESIDUAL * max(1.0, float(np.abs(d).max())):
+            raise SolverError(
+                f"the spline misses its landmarks by {misfit:.1e} mm: two of the {m} landmarks lie too close "
+                "together; thin them out or give them a finite stiffness"
+            )
+        return Spline(
+            self.kernel, self.landmarks, solution[: m * c], solution[m * c :], self.centre, self.scale
+        )
+
+
+def factor(kernel: Kernel, landmarks: ArrayLike, stiffness: ArrayLike | None = None) -> FactoredSpline:
+    """Assemble and factor L, equation (6).
+
+    Parameters
+    ----------
+    kernel : Kernel
+        `ThinPlate` or `Elastic`.
+    landmarks : array_like, shape (m, 2)
+        Source points (rest positions), mm.
+    stiffness : array_like, shape (m,), optional
+        How firmly each landmark holds its displacement (Rohr et al. 2001): the spline minimises
+        sum k |d - u|^2 + energy. Infinite (the default) interpolates. Thin plate: 1/mm^2, beside the bending
+        energy (1). Elastic: relative to the shear modulus.
+
+    Returns
+    -------
+    FactoredSpline
+
+    Raises
+    ------
+    InputError
+        If landmarks are too few, collinear, coincident or not finite, or a stiffness is not positive.
+    """
+    points = as_points(landmarks, "landmarks")
+    m, c = len(points), kernel.components
+    need = 3 if c == 1 else 2
+    if m < need:
+        raise InputError(f"a spline needs at least {need} landmarks; got {m}")
+    centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    scale = float(np.ptp(points, axis=0).max()) / 2 or 1.0
+    x = (points - centre) / scale
+    _refuse_degenerate(kernel, points, x)
+    conditioned = kernel.scaled(scale)
+    K = conditioned.matrix(x, x)
+    R = conditioned.polynomial(x)
+    if stiffness is not None:
+        k = np.broadcast_to(np.asarray(stiffness, dtype=np.float64), (m,))
+        if not (k > 0).all():
+            raise InputError(f"every stiffness must be positive (or infinite); got {k.min()}")
+        K = K + np.diag(np.tile(compliance(kernel, k) / scale**kernel.length_power, c))
+    p = R.shape[1]
+    L = np.block([[K, R], [R.T, np.zeros((p, p))]])
+    return FactoredSpline(conditioned, points, centre, scale, L, lu_factor(L, check_finite=False))
+
+
+def compliance(kernel: Kernel, stiffness: Floats) -> Floats:
+    """Return the diagonal that a stiffness adds to K in unconditioned mm: 16 pi / k, for either kernel.
+
+    Both kernels solve an equation whose right side is 16 pi times the point load, so a spring of stiffness k
+    between target and field adds 16 pi / k.
+    """
+    added: Floats = 16.0 * np.pi / stiffness
+    return added
+
+
+def _refuse_degenerate(kernel: Kernel, points: Floats, x: Floats) -> None:
+    pairs = cKDTree(x).query_pairs(1e-9)
+    if pairs:
+        i, j = min(pairs)
+        raise InputError(
+            f"landmarks {i} and {j} coincide at ({points[i, 0]:g}, {points[i, 1]:g}) mm; keep one of them"
+        )
+    singular = np.linalg.svd(kernel.polynomial(x), compute_uv=False)
+    if singular[-1] < 1e-9 * singular[0]:
+        raise InputError(
+            f"the {len(points)} landmarks lie on one line, so a spline is not determined; add one beside it"
+        )
+
+
+def _as_blocks(vectors: Floats, c: int) -> Floats:
+    """(m, 2) vectors as the right-hand side of a kernel with c components."""
+    return vectors if c == 1 else vectors.T.reshape(-1, 1)
+
+
+def _as_vectors(blocks: Floats, c: int) -> Floats:
+    """Inverse of `_as_blocks`."""
+    return blocks if c == 1 else np.ascontiguousarray(blocks.reshape(2, -1).T)
