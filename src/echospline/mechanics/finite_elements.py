@@ -21,7 +21,7 @@ from skfem import Basis, BilinearForm, ElementQuad1, ElementVector, MeshQuad
 from echospline.errors import InputError, SolverError
 from echospline.grid import Floats, RegularGrid, as_points
 
-Law = Literal["plane stress", "plane strain"]
+Plane = Literal["stress", "strain"]
 Integration = Literal["full", "selective"]
 Method = Literal["cholmod", "superlu"]
 
@@ -47,7 +47,7 @@ def element_centres(grid: RegularGrid) -> Floats:
     return centres
 
 
-def lame(young: ArrayLike, poisson: ArrayLike, law: Law = "plane stress") -> tuple[Floats, Floats]:
+def lame(young: ArrayLike, poisson: ArrayLike, plane: Plane = "stress") -> tuple[Floats, Floats]:
     """First and second Lamé parameter in kPa, such that stress = lambda tr(strain) I + 2 mu strain.
 
     For plane stress lambda is E nu / (1 - nu^2), which is equation (19); for plane strain
@@ -58,22 +58,20 @@ def lame(young: ArrayLike, poisson: ArrayLike, law: Law = "plane stress") -> tup
     InputError
         If E is not positive, or nu is not inside (-1, 0.5] for plane stress, (-1, 0.5) for plane strain.
     """
-    if law not in get_args(Law):
-        raise InputError(f"the law is one of {', '.join(get_args(Law))}; got {law!r}")
+    if plane not in get_args(Plane):
+        raise InputError(f'plane is "stress" or "strain"; got {plane!r}')
     E, nu = np.broadcast_arrays(np.asarray(young, dtype=np.float64), np.asarray(poisson, dtype=np.float64))
     if not (np.isfinite(E).all() and (E > 0).all()):
         raise InputError(f"Young's modulus must be positive numbers in kPa; got {_offender(E, E > 0)}")
-    inside = (nu > -1) & ((nu <= 0.5) if law == "plane stress" else (nu < 0.5))
+    inside = (nu > -1) & ((nu <= 0.5) if plane == "stress" else (nu < 0.5))
     if not inside.all():
-        hint = (
-            "" if law == "plane stress" else "; incompressible tissue: use plane stress, or nu up to 0.4999"
-        )
-        closing = "]" if law == "plane stress" else ")"
+        hint = "" if plane == "stress" else "; incompressible tissue: use plane stress, or nu up to 0.4999"
+        closing = "]" if plane == "stress" else ")"
         raise InputError(
-            f"Poisson's ratio in {law} must lie in (-1, 0.5{closing}; got {_offender(nu, inside)}{hint}"
+            f"Poisson's ratio in plane {plane} must lie in (-1, 0.5{closing}; got {_offender(nu, inside)}{hint}"
         )
     mu = E / (2 * (1 + nu))
-    lam = E * nu / (1 - nu**2) if law == "plane stress" else E * nu / ((1 + nu) * (1 - 2 * nu))
+    lam = E * nu / (1 - nu**2) if plane == "stress" else E * nu / ((1 + nu) * (1 - 2 * nu))
     return lam, mu
 
 
@@ -82,7 +80,7 @@ def stiffness(
     young: ArrayLike,
     poisson: ArrayLike,
     thickness: float,
-    law: Law = "plane stress",
+    plane: Plane = "stress",
     integration: Integration = "full",
 ) -> Any:
     """Assemble the global stiffness matrix K of equation (23).
@@ -95,7 +93,7 @@ def stiffness(
         E in kPa and nu, one number or one per element (`element_centres` says where).
     thickness : float
         Thickness of the slab across the imaging plane, mm.
-    law : {"plane stress", "plane strain"}
+    plane : {"stress", "strain"}
         Plane stress is equation (19).
     integration : {"full", "selective"}
         "selective" takes the volumetric part at the element's centre only, which keeps nearly
@@ -114,8 +112,8 @@ def stiffness(
         raise InputError(f"thickness must be a positive number in mm; got {thickness}")
     if integration not in get_args(Integration):
         raise InputError(f"integration is one of {', '.join(get_args(Integration))}; got {integration!r}")
-    lam, mu = lame(young, poisson, law)
-    if law == "plane strain" and integration == "full" and (np.asarray(poisson) > LOCKING).any():
+    lam, mu = lame(young, poisson, plane)
+    if plane == "strain" and integration == "full" and (np.asarray(poisson) > LOCKING).any():
         raise InputError(
             f"bilinear elements in plane strain lock for nu above {LOCKING}: the mesh would be far too stiff; "
             "use integration='selective' or plane stress"

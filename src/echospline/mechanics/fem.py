@@ -1,0 +1,228 @@
+"""The tissue model that the spline is compared with: finite elements under the same needle, section IV of the paper.
+
+The needle acts by forces: a cutting force at the tip and friction along the shaft, as consistent nodal loads
+wherever it lies. Between steps the tissue remembers only the loads that still act on it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from math import exp, isfinite
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from echospline.errors import InputError
+from echospline.grid import Floats, RegularGrid
+from echospline.mechanics.finite_elements import (
+    Integration,
+    Method,
+    factor,
+    interpolate,
+    line_loads,
+    point_loads,
+    stiffness,
+)
+from echospline.needle import ZERO_LENGTH, NeedlePose
+from echospline.tissue import Tissue
+
+
+@dataclass(frozen=True)
+class NeedleForces:
+    """What the needle exerts on the tissue.
+
+    Parameters
+    ----------
+    tip : float
+        Cutting force at the tip along the axis while the needle advances, N. It stays while the needle rests and
+        dies away on withdrawal. The paper's F = 0.4 N.
+    friction : float
+        Viscous friction per mm of shaft and per mm/s of axial speed, N s/mm^2. The paper's 1e-5 N s/m is read
+        per mm of shaft: 1e-8 N s/mm^2. At 5 mm/s and 30 mm that is 1.5e-6 N, nothing beside the tip; 1e-3 makes
+        friction (0.15 N) comparable with cutting.
+    alpha3 : float
+        Rate at which friction relaxes once the needle slows, equation (16), 1/s.
+    ramp : float
+        Needle travel over which forces build up, and the tip's dies away, mm: 63 % after one ramp. 0 is at once,
+        the paper's law.
+
+    Raises
+    ------
+    InputError
+        If a number is out of its range.
+    """
+
+    tip: float = 0.4
+    friction: float = 1e-8
+    alpha3: float = 1.0
+    ramp: float = 1.0
+
+    def __post_init__(self) -> None:
+        units = {"tip": "N", "friction": "N s/mm^2", "alpha3": "1/s", "ramp": "mm"}
+        for name, unit in units.items():
+            value = getattr(self, name)
+            if not (isfinite(value) and value >= 0):
+                raise InputError(f"{name} must be zero or a positive number in {unit}; got {value}")
+
+
+@dataclass(frozen=True)
+class FEMState:
+    """What the tissue remembers.
+
+    Attributes
+    ----------
+    pose : NeedlePose or None
+        The last pose; None at rest.
+    tip : float
+        Force at the tip along the axis, N.
+    friction : ndarray, shape (n, 2)
+        Nodal loads of friction, N.
+    displacement : ndarray, shape (n, 2)
+        Of the nodes, mm.
+    """
+
+    pose: NeedlePose | None
+    tip: float
+    friction: Floats
+    displacement: Floats
+
+
+class FEMModel:
+    """Linear plane elasticity, clamped along edges, under a needle's forces; factored once, solved per step.
+
+    Parameters
+    ----------
+    grid : RegularGrid
+        Nodes of the mesh.
+    clamped : iterable of {"top", "bottom", "left", "right"}
+        Edges held fast: the same along which the spline has its anchors.
+    tissue : Tissue
+        Moduli per region, thickness, plane stress or strain.
+    forces : NeedleForces
+        What the needle exerts.
+    solver : {"cholmod", "superlu"}
+        See `finite_elements.factor`.
+    integration : {"full", "selective"}, optional
+        See `finite_elements.stiffness`; by default selective where plane strain would lock, else full.
+
+    Raises
+    ------
+    InputError
+        If the mesh, the clamp or a modulus does not make a solvable system.
+    """
+
+    def __init__(
+        self,
+        grid: RegularGrid,
+        clamped: Iterable[str] = ("left", "right", "bottom"),
+        tissue: Tissue | None = None,
+        forces: NeedleForces | None = None,
+        *,
+        solver: Method = "cholmod",
+        integration: Integration | None = None,
+    ) -> None:
+        self._grid = grid
+        self.tissue = tissue or Tissue()
+        self.forces = forces or NeedleForces()
+        self.clamped = grid.boundary(clamped)
+        young, poisson = self.tissue.in_cells(grid)
+        if integration is None:
+            integration = "selective" if self.tissue.plane == "strain" else "full"
+        self.stiffness = stiffness(
+            grid, young, poisson, self.tissue.thickness, self.tissue.plane, integration
+        )
+        self.factored = factor(self.stiffness, self.clamped, solver)
+
+    @property
+    def grid(self) -> RegularGrid:
+        """The mesh."""
+        return self._grid
+
+    def rest(self) -> FEMState:
+        """Tissue that no needle has touched."""
+        return FEMState(None, 0.0, np.zeros((self.grid.size, 2)), np.zeros((self.grid.size, 2)))
+
+    def advance(self, state: FEMState, pose: NeedlePose, dt: float) -> FEMState:
+        """Loads of the new pose and the displacement under them, equation (23).
+
+        Raises
+        ------
+        InputError
+            If dt is negative or not finite.
+        """
+        if not (isfinite(dt) and dt >= 0):
+            raise InputError(f"dt must be zero or a positive number in s; got {dt}")
+        built = self._built_up(state.pose, pose)
+        friction = relaxing(state.friction, self.friction_loads(pose), built, exp(-self.forces.alpha3 * dt))
+        tip = self._tip_force(state.tip, pose, built)
+        displacement = self.factored.solve(friction + self.tip_loads(pose, tip))
+        return FEMState(pose, tip, friction, displacement)
+
+    def displacement(self, state: FEMState) -> Floats:
+        """Displacement of the nodes, shape (n, 2), mm."""
+        return state.displacement
+
+    def displacement_at(self, state: FEMState, points: ArrayLike) -> Floats:
+        """Displacement of any reference points of the mesh, equation (22), shape (n, 2), mm.
+
+        Raises
+        ------
+        InputError
+            If a point lies outside the mesh: there is no tissue.
+        """
+        return interpolate(self.grid, state.displacement, points)
+
+    def friction_loads(self, pose: NeedlePose) -> Floats:
+        """Nodal loads (n, 2) in N of steady friction at this pose and speed."""
+        if pose.depth < ZERO_LENGTH or pose.speed == 0 or self.forces.friction == 0:
+            return np.zeros((self.grid.size, 2))
+        per_mm = self.forces.friction * pose.speed * np.array(pose.axis)
+        return line_loads(self.grid, pose.entry, pose.tip, per_mm)
+
+    def tip_loads(self, pose: NeedlePose, force: float) -> Floats:
+        """Nodal loads (n, 2) in N of a force (N) at the tip along the axis; none where the tip is out of the tissue."""
+        if force == 0 or pose.depth < ZERO_LENGTH or not self.grid.contains(pose.tip)[0]:
+            return np.zeros((self.grid.size, 2))
+        return point_loads(self.grid, pose.tip, force * np.array(pose.axis))
+
+    def _built_up(self, before: NeedlePose | None, after: NeedlePose) -> float:
+        """Share of a force that is still missing after the needle's travel in this step: exp(-travel / ramp)."""
+        travel = (
+            after.depth
+            if before is None
+            else max(
+                float(np.hypot(*np.subtract(after.tip, before.tip))),
+                float(np.hypot(*np.subtract(after.entry, before.entry))),
+            )
+        )
+        if self.forces.ramp == 0:
+            return 0.0
+        return exp(-travel / self.forces.ramp)
+
+    def _tip_force(self, force: float, pose: NeedlePose, missing: float) -> float:
+        inside = pose.depth >= ZERO_LENGTH and bool(self.grid.contains(pose.tip)[0])
+        if not inside:
+            return 0.0
+        if pose.speed == 0:
+            return force
+        target = self.forces.tip if pose.speed > 0 else 0.0
+        return target + (force - target) * missing
+
+
+def relaxing(q: Floats, target: Floats, missing: float, decay: float) -> Floats:
+    """Nodal loads after a step: those that grow build up with the needle's travel, the others relax, equation (16).
+
+    Parameters
+    ----------
+    q, target : ndarray, shape (n, 2)
+        Loads so far and loads of steady motion, N.
+    missing : float
+        Share still missing of a load that grows.
+    decay : float
+        exp(-alpha3 dt), share left of a load that relaxes.
+    """
+    growing = np.sum((target - q) * target, axis=1, keepdims=True) > 0
+    share = np.where(growing, missing, decay)
+    relaxed: Floats = target + (q - target) * share
+    return relaxed
