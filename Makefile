@@ -25,6 +25,7 @@ check: setup
 	$(BIN)/lint-imports
 
 test: setup
+	tests/install-system
 	$(BIN)/python -m pytest
 
 format: setup

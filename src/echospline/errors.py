@@ -11,6 +11,10 @@ class InputError(EchosplineError, ValueError):
     """A file, an option or an argument is not what it must be; the command line exits with code 2."""
 
 
+class ProtocolError(InputError):
+    """Bytes from the network are not what the protocol says; the peer that sent them is at fault."""
+
+
 class FoldingError(EchosplineError):
     """A deformation folds the image over itself (Jacobian <= 0) and the caller asked to refuse that."""
 

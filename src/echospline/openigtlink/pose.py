@@ -1,0 +1,113 @@
+"""Where a tool is: TRANSFORM (a 4 x 4 matrix) and POSITION (a point and a quaternion)."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from echospline.errors import InputError, ProtocolError
+from echospline.grid import Floats
+
+_COLUMNS = struct.Struct(">12f")
+
+
+@dataclass(frozen=True, eq=False)
+class Transform:
+    """TRANSFORM: takes column vectors of the frame named first to the one named second (``NeedleToReference``).
+
+    Parameters
+    ----------
+    matrix : ndarray, shape (4, 4)
+        Last row 0 0 0 1; translation in mm, RAS.
+    """
+
+    TYPE: ClassVar[str] = "TRANSFORM"
+    matrix: Floats
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "matrix", as_transform(self.matrix))
+
+    def pack(self) -> bytes:
+        """48 bytes: the columns, without the last row."""
+        return self.matrix[:3].T.astype(">f4").tobytes()
+
+    @classmethod
+    def unpack(cls, content: memoryview) -> Transform:
+        """Matrix of 48 bytes."""
+        if len(content) != _COLUMNS.size:
+            raise ProtocolError(f"a TRANSFORM has 48 bytes; got {len(content)}")
+        matrix = np.eye(4)
+        matrix[:3] = np.frombuffer(content, dtype=">f4").reshape(4, 3).T
+        if not np.isfinite(matrix).all():
+            raise ProtocolError("a TRANSFORM must hold finite numbers; got NaN or infinity")
+        return cls(matrix)
+
+
+@dataclass(frozen=True, eq=False)
+class Position:
+    """POSITION: a point in mm and a unit quaternion (x, y, z, w).
+
+    Peers may leave the quaternion out (12 bytes) or its w (24 bytes); the rest follows from its length 1.
+    """
+
+    TYPE: ClassVar[str] = "POSITION"
+    position: tuple[float, float, float]
+    quaternion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+
+    def pack(self) -> bytes:
+        """28 bytes."""
+        return struct.pack(">7f", *self.position, *self.quaternion)
+
+    @classmethod
+    def unpack(cls, content: memoryview) -> Position:
+        """Position of 12, 24 or 28 bytes."""
+        if len(content) not in (12, 24, 28):
+            raise ProtocolError(f"a POSITION has 12, 24 or 28 bytes; got {len(content)}")
+        values = [float(v) for v in np.frombuffer(content, dtype=">f4")]
+        if not np.isfinite(values).all():
+            raise ProtocolError("a POSITION must hold finite numbers; got NaN or infinity")
+        x, y, z = values[3:6] or (0.0, 0.0, 0.0)
+        w = values[6] if len(values) == 7 else max(0.0, 1.0 - x * x - y * y - z * z) ** 0.5
+        return cls((values[0], values[1], values[2]), (x, y, z, w))
+
+    def matrix(self) -> Floats:
+        """The same as a 4 x 4 matrix.
+
+        Raises
+        ------
+        ProtocolError
+            If the quaternion is no rotation (its length is not 1 within a thousandth).
+        """
+        x, y, z, w = self.quaternion
+        length = (x * x + y * y + z * z + w * w) ** 0.5
+        if abs(length - 1.0) > 1e-3:
+            raise ProtocolError(f"the quaternion of a POSITION has length 1; got {length:.4g}")
+        x, y, z, w = x / length, y / length, z / length, w / length
+        return np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w), self.position[0]],
+                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w), self.position[1]],
+                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y), self.position[2]],
+                [0.0, 0.0, 0.0, 1.0],
+            ]
+        )
+
+
+def as_transform(matrix: Floats) -> Floats:
+    """Check a 4 x 4 matrix and return it as float64.
+
+    Raises
+    ------
+    InputError
+        If the shape is another, a number is not finite or the last row is not 0 0 0 1.
+    """
+    array = np.array(matrix, dtype=np.float64)
+    if array.shape != (4, 4):
+        raise InputError(f"a transform is a 4 x 4 matrix; got shape {array.shape}")
+    if not np.isfinite(array).all() or not np.array_equal(array[3], (0, 0, 0, 1)):
+        raise InputError(f"a transform has finite numbers and the last row 0 0 0 1; got {array.tolist()}")
+    array.setflags(write=False)
+    return array
