@@ -1,0 +1,82 @@
+"""A cine as a folder of numbered PNG files beside ``times.csv``."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from echospline.errors import InputError
+from echospline.image import Pixels
+
+_OURS = re.compile(r"frame_\d{5,}\.png|times\.csv|\.unfinished\.png")
+
+
+class FramesEncoder:
+    """Writes ``frame_00000.png`` and so on into a temporary folder; each file appears whole.
+
+    Parameters
+    ----------
+    part : Path
+        Temporary folder; one left by an earlier run is emptied.
+
+    Raises
+    ------
+    InputError
+        If the folder to be replaced holds anything but frames.
+    """
+
+    def __init__(self, part: Path) -> None:
+        final = part.with_name(part.name.removesuffix(".part"))
+        for folder in (part, final):
+            check_ours(folder)
+        if part.exists():
+            shutil.rmtree(part)
+        part.mkdir()
+        self._part = part
+        self._count = 0
+        self._times = (part / "times.csv").open("w", encoding="ascii", newline="\n")
+        self._times.write("frame,time_s\n")
+
+    def add(self, pixels: Pixels, time: float) -> None:
+        """Write one PNG, then its line in ``times.csv``."""
+        unfinished = self._part / ".unfinished.png"
+        Image.fromarray(np.ascontiguousarray(pixels)).save(unfinished, format="PNG", compress_level=1)
+        os.replace(unfinished, self._part / f"frame_{self._count:05d}.png")
+        self._times.write(f"{self._count},{time!r}\n")
+        self._times.flush()
+        self._count += 1
+
+    def finish(self) -> Path:
+        """Close ``times.csv``."""
+        self._times.close()
+        return self._part
+
+    def abandon(self) -> None:
+        """Close ``times.csv``; the frames stay."""
+        self._times.close()
+
+
+def check_ours(folder: Path) -> None:
+    """Refuse to replace a folder that holds anything but frames.
+
+    Raises
+    ------
+    InputError
+        If it is a file or holds other files.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder} is a file; expected a folder for frames or a name that is free")
+    stranger = (
+        next((f.name for f in folder.iterdir() if not _OURS.fullmatch(f.name)), None)
+        if folder.is_dir()
+        else None
+    )
+    if stranger is not None:
+        raise InputError(
+            f"{folder} holds {stranger!r}, which is no frame: give the name of a new folder for the frames"
+        )

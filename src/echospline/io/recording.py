@@ -1,0 +1,163 @@
+"""A file whose header has been read and checked and whose pixels are decoded frame by frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from echospline.errors import EchosplineError, InputError
+from echospline.grid import Floats
+from echospline.image import Pixels
+
+Box = tuple[int, int, int, int]
+"""(left, top, right, bottom) in pixels of the file; right and bottom lie just outside."""
+
+LIMIT = 2048.0
+"""MiB of decoded pixels that a reader takes unless told otherwise."""
+
+MIB = 2**20
+LUMA = np.array([0.299, 0.587, 0.114])
+"""Weights of red, green and blue in grey: ITU-R BT.601, the matrix of DICOM's YBR_FULL too."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """A part of the picture that the file itself describes (a DICOM ultrasound region).
+
+    Parameters
+    ----------
+    box : (left, top, right, bottom)
+        Pixels of the file, right and bottom just outside.
+    spacing : (lateral, depth) or None
+        mm per pixel; None where the region has no lengths (a spectrum, an M-mode trace).
+    content : str
+        What it shows, e.g. "2-D tissue".
+    """
+
+    box: Box
+    spacing: tuple[float, float] | None
+    content: str
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What a file declares, and how to get at its pixels.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    format : str
+        Name of the format, for people.
+    rows, columns : int
+        Size of one frame.
+    frames : int or None
+        Number of frames; None when only decoding can tell.
+    channels : int
+        1 (grey) or 3 (RGB).
+    dtype : dtype
+        Of the decoded pixels.
+    decode : callable
+        ``decode(None)`` yields every frame, ``decode(i)`` frame i alone, each
+        (rows, columns) or (rows, columns, 3).
+    spacing : (lateral, depth), optional
+        mm per pixel, where the file says so.
+    origin : (x, y)
+        Position of the first pixel's centre in mm, where the file says so.
+    region : Box, optional
+        Where the tissue is; the whole frame when None.
+    regions : tuple of Region
+        All regions the file describes.
+    times : ndarray, shape (frames,), optional
+        Seconds since the first frame, where the file says so.
+    single : bool
+        Whether the file is a still image (then one frame is read as an image, not as a cine).
+    notes : tuple of str
+        What a reader had to work out or doubt, one sentence each.
+    """
+
+    path: Path
+    format: str
+    rows: int
+    columns: int
+    frames: int | None
+    channels: int
+    dtype: np.dtype[Any]
+    decode: Callable[[int | None], Iterator[Pixels]] = field(repr=False)
+    spacing: tuple[float, float] | None = None
+    origin: tuple[float, float] = (0.0, 0.0)
+    region: Box | None = None
+    regions: tuple[Region, ...] = ()
+    times: Floats | None = None
+    single: bool = False
+    notes: tuple[str, ...] = ()
+
+    @property
+    def frame_bytes(self) -> int:
+        """Bytes of one decoded frame."""
+        return self.rows * self.columns * self.channels * self.dtype.itemsize
+
+    def spacing_of(self, box: Box) -> tuple[float, float] | None:
+        """Return the spacing in mm of the region that holds a box's centre; the file's own outside of all."""
+        x, y = (box[0] + box[2]) / 2, (box[1] + box[3]) / 2
+        for region in self.regions:
+            left, top, right, bottom = region.box
+            if region.spacing and left <= x < right and top <= y < bottom:
+                return region.spacing
+        return self.spacing
+
+
+def check_size(path: Path, rows: int, columns: int, frames: int, bytes_per_pixel: int, limit: float) -> None:
+    """Refuse a declared size beyond ``limit`` (MiB) before anything is allocated.
+
+    Raises
+    ------
+    InputError
+        If the size is not positive or too large.
+    """
+    if min(rows, columns, frames) < 1:
+        raise InputError(
+            f"{path} declares {frames} frames of {columns} x {rows} pixels; expected one or more of each: "
+            "the file is damaged"
+        )
+    size = rows * columns * frames * bytes_per_pixel / MIB
+    if size > limit:
+        raise InputError(
+            f"{path} declares {frames} x {columns} x {rows} pixels = {size:,.0f} MiB, more than the limit of "
+            f"{limit:,.0f} MiB: take one frame, or raise the limit if the file is trusted"
+        )
+
+
+def to_grey(pixels: Pixels) -> Pixels:
+    """Luma of an RGB frame in its own type, rounded; a grey frame as it is."""
+    if pixels.ndim == 2:
+        return pixels
+    grey: Pixels = pixels.astype(np.float64) @ LUMA
+    return (np.rint(grey) if np.issubdtype(pixels.dtype, np.integer) else grey).astype(pixels.dtype)
+
+
+@contextmanager
+def decoding(path: Path, what: str) -> Iterator[None]:
+    """Turn whatever a decoder raises on a damaged file into one sentence.
+
+    Decoders meet damaged bytes with struct.error, KeyError, EOFError, SyntaxError and a dozen kinds of
+    their own, so every Exception is taken; echospline's own errors pass.
+    """
+    try:
+        yield
+    except EchosplineError:
+        raise
+    except MemoryError:
+        raise InputError(
+            f"{path} needs more memory than there is: take one frame or a smaller file"
+        ) from None
+    except Exception as error:
+        reason = " ".join(str(error).split())[:160] or type(error).__name__
+        raise InputError(
+            f"{path} is damaged or cut short: expected a whole {what} file, but its decoder says: {reason}"
+        ) from error

@@ -1,0 +1,213 @@
+"""Write a cine frame by frame; only a finished file ever carries its final name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import isfinite
+from pathlib import Path
+from types import TracebackType
+from typing import Protocol, Self
+
+import numpy as np
+
+from echospline.errors import InputError
+from echospline.grid import RegularGrid
+from echospline.image import Pixels
+from echospline.io.part import give_name, part_of, writing
+
+FORMATS = (".mp4", ".gif", ".mha")
+
+
+class Encoder(Protocol):
+    """Turns checked frames into the bytes of one format, under a temporary name."""
+
+    def add(self, pixels: Pixels, time: float) -> None:
+        """Write one frame; time in s."""
+
+    def finish(self) -> Path:
+        """Complete the file and return its (still temporary) path."""
+
+    def abandon(self) -> None:
+        """Close what is open and leave the partial file where it is."""
+
+
+class CineWriter:
+    """Writes frames one by one to one file or folder; holds none of them.
+
+    While it writes, the file is called ``NAME.part``. `close` completes it and gives it its name in one
+    step. If the ``with`` block ends with an exception, or the process dies, ``NAME.part`` stays behind with
+    the frames so far, readable, and whatever was called NAME before is untouched.
+
+    Parameters
+    ----------
+    path : Path
+        Final name.
+    grid : RegularGrid
+        Pixel centres of every frame, mm.
+    encoder : callable
+        ``encoder(part, grid, colour, dtype)`` opens the temporary file.
+    types : tuple of dtype
+        Pixel types the format holds; empty for any.
+    window : (low, high), optional
+        Pixel values shown as black and white, for pixels of other types.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        grid: RegularGrid,
+        encoder: Callable[[Path, RegularGrid, bool, np.dtype[np.generic]], Encoder],
+        types: tuple[np.dtype[np.generic], ...] = (),
+        window: tuple[float, float] | None = None,
+    ) -> None:
+        self.path = path
+        self.grid = grid
+        self.count = 0
+        self._open, self._types, self._window = encoder, types, window
+        self._encoder: Encoder | None = None
+        self._last = -np.inf
+        self._form: tuple[tuple[int, ...], np.dtype[np.generic]] | None = None
+        self._closed = False
+
+    def add(self, pixels: Pixels, time: float) -> None:
+        """Write one frame.
+
+        Parameters
+        ----------
+        pixels : ndarray, shape (rows, columns) or (rows, columns, 3)
+            Grey or RGB, of one shape and type for all frames.
+        time : float
+            s; later than the frame before.
+
+        Raises
+        ------
+        InputError
+            If the frame does not fit the grid, the format or the frames before.
+        """
+        if self._closed:
+            raise InputError(f"{self.path} is closed: no frame can be added")
+        pixels = np.asarray(pixels)
+        form = (pixels.shape, pixels.dtype)
+        rows_columns = (self.grid.shape[1], self.grid.shape[0])
+        if pixels.shape not in (rows_columns, (*rows_columns, 3)) or self._form not in (None, form):
+            expected = (
+                f"{self._form[0]} {self._form[1]}"
+                if self._form
+                else f"{rows_columns} or {(*rows_columns, 3)}"
+            )
+            raise InputError(
+                f"a frame of {self.path.name} must be {expected}; got {pixels.shape} {pixels.dtype}"
+            )
+        if not isfinite(time) or time <= self._last:
+            raise InputError(
+                f"a frame of {self.path.name} must be later than the one before at {self._last} s; got {time} s"
+            )
+        pixels = self._fitting(pixels)
+        if self._encoder is None:
+            self._form = form
+            part = part_of(self.path)
+            with writing(self.path):
+                part.parent.mkdir(parents=True, exist_ok=True)
+                self._encoder = self._open(part, self.grid, pixels.ndim == 3, pixels.dtype)
+        with writing(self.path):
+            self._encoder.add(pixels, float(time))
+        self._last = float(time)
+        self.count += 1
+
+    def close(self) -> None:
+        """Complete the file and give it its final name; a second call does nothing.
+
+        Raises
+        ------
+        InputError
+            If no frame was added or the file cannot be written.
+        """
+        if self._closed:
+            return
+        self._closed = True
+        if self._encoder is None:
+            raise InputError(f"no frame was added to {self.path}: a cine needs one or more")
+        with writing(self.path):
+            give_name(self._encoder.finish(), self.path)
+            part_of(self.path).unlink(missing_ok=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self.close()
+        elif not self._closed:
+            self._closed = True
+            if self._encoder is not None:
+                self._encoder.abandon()
+
+    def _fitting(self, pixels: Pixels) -> Pixels:
+        if not self._types or (pixels.dtype in self._types and self._window is None):
+            return pixels
+        if self._window is None:
+            raise InputError(
+                f"{self.path.name} holds pixels of {', '.join(str(t) for t in self._types)}; got {pixels.dtype}: "
+                "give window=(low, high), the values shown as black and white"
+            )
+        low, high = self._window
+        shade = np.rint((pixels.astype(np.float64) - low) * (255.0 / (high - low)))
+        if not np.isfinite(shade).all():
+            raise InputError(f"a frame of {self.path.name} holds values that are not finite")
+        return np.clip(shade, 0, 255).astype(np.uint8)
+
+
+def open_writer(
+    path: str | Path, grid: RegularGrid, fps: float = 30.0, *, window: tuple[float, float] | None = None
+) -> CineWriter:
+    """Open a cine for writing; the name's suffix chooses the format.
+
+    Parameters
+    ----------
+    path : str or Path
+        ``.mp4`` (H.264, plays in browsers), ``.gif``, ``.mha`` (sequence for ITK, 3D Slicer, PLUS), or a name
+        without suffix: a folder of numbered PNG files beside ``times.csv``.
+    grid : RegularGrid
+        Pixel centres of every frame, mm.
+    fps : float
+        Nominal frames per second; each frame's own time rules, this is only how long the last one lasts.
+    window : (low, high), optional
+        Pixel values shown as black and white. Needed for pixels other than 8-bit in MP4 and GIF (8 and 16-bit
+        in PNG); values outside are shown as black or white.
+
+    Raises
+    ------
+    InputError
+        If the suffix is another, or fps or window is out of range.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if not (isfinite(fps) and fps > 0):
+        raise InputError(f"fps must be a positive number of frames per second; got {fps}")
+    if window is not None and not (len(window) == 2 and np.isfinite(window).all() and window[0] < window[1]):
+        raise InputError(f"window must be two pixel values, low before high; got {window}")
+    byte = np.dtype(np.uint8)
+    # The encoders' libraries are large: each is imported when a file of its kind is written.
+    if suffix == ".mp4":
+        from echospline.io.mp4 import Mp4Encoder  # noqa: PLC0415
+
+        return CineWriter(path, grid, lambda p, g, c, t: Mp4Encoder(p, g, c, fps), (byte,), window)
+    if suffix == ".gif":
+        from echospline.io.gif import GifEncoder  # noqa: PLC0415
+
+        return CineWriter(path, grid, lambda p, g, c, t: GifEncoder(p, g, c, fps), (byte,), window)
+    if suffix == ".mha":
+        from echospline.io.metaimage import MetaImageEncoder  # noqa: PLC0415
+
+        return CineWriter(path, grid, lambda p, g, c, t: MetaImageEncoder(p, g, c, t, fps), (), window)
+    if suffix == "":
+        from echospline.io.frames import FramesEncoder  # noqa: PLC0415
+
+        return CineWriter(
+            path, grid, lambda p, g, c, t: FramesEncoder(p), (byte, np.dtype(np.uint16)), window
+        )
+    raise InputError(
+        f"a cine is written as {', '.join(FORMATS)} or to a folder of PNG files (no suffix); got {path.name!r}"
+    )

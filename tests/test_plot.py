@@ -1,0 +1,78 @@
+"""Figures: the drawing's geometry is in millimetres and says what the numbers say."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from echospline.data import sample_image
+from echospline.errors import InputError
+from echospline.grid import RegularGrid
+from echospline.needle import NeedlePose
+from echospline.plot import summary_figure
+
+IMAGE = sample_image()
+MESH = RegularGrid.covering(IMAGE.grid, (40, 30))
+POSE = NeedlePose((18.0, 0.0), (30.0, 18.0), 5.0)
+
+
+def push(mesh: RegularGrid, size: float = 1.5) -> np.ndarray:
+    away = ((mesh.nodes - POSE.tip) ** 2).sum(axis=1, keepdims=True)
+    return size * np.exp(-away / 60) * np.array(POSE.axis)
+
+
+@pytest.mark.parametrize("suffix", ["png", "svg", "pdf"])
+def test_the_figure_is_whole_and_the_same_each_time(tmp_path: Path, suffix: str) -> None:
+    for name in ("one", "two"):
+        summary_figure(IMAGE, IMAGE, MESH, push(MESH), POSE, tmp_path / f"{name}.{suffix}", title="calf")
+    one, two = ((tmp_path / f"{name}.{suffix}").read_bytes() for name in ("one", "two"))
+    if suffix == "png":
+        assert one == two
+    assert len(list(tmp_path.iterdir())) == 2  # no temporary file is left
+
+
+def test_the_svg_says_depth_and_largest_displacement(tmp_path: Path) -> None:
+    summary_figure(IMAGE, IMAGE, MESH, push(MESH), POSE, tmp_path / "a.svg")
+    comments = (tmp_path / "a.svg").read_text(encoding="utf-8")
+    ElementTree.fromstring(comments)  # well formed
+    largest = np.hypot(*push(MESH).T).max()
+    assert f"Displacement, largest {largest:.2f} mm" in comments
+    assert f"Needle {np.hypot(12, 18):.1f} mm deep" in comments
+
+
+def test_the_displaced_place_is_the_bright_one(tmp_path: Path) -> None:
+    summary_figure(IMAGE, IMAGE, MESH, push(MESH), POSE, tmp_path / "a.png")
+    summary_figure(IMAGE, IMAGE, MESH, np.zeros((MESH.size, 2)), POSE, tmp_path / "b.png")
+    with Image.open(tmp_path / "a.png") as a, Image.open(tmp_path / "b.png") as b:
+        assert a.size == b.size
+        # cividis runs from blue to yellow: count pixels whose red is well above their blue
+        moved, still = (
+            int((np.asarray(p.convert("RGB")).astype(int) @ [1, 0, -1] > 90).sum()) for p in (a, b)
+        )
+    assert moved > still + 2000
+
+
+def test_a_mesh_of_one_node_per_pixel_can_be_drawn(tmp_path: Path) -> None:
+    mesh = RegularGrid.covering(IMAGE.grid, IMAGE.grid.shape)
+    summary_figure(IMAGE, IMAGE, mesh, push(mesh), POSE, tmp_path / "fine.png")
+    assert (tmp_path / "fine.png").stat().st_size > 100_000
+
+
+def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="displacement must be"):
+        summary_figure(IMAGE, IMAGE, MESH, push(MESH)[1:], POSE, tmp_path / "a.png")
+    with pytest.raises(InputError, match=r"written as \.png"):
+        summary_figure(IMAGE, IMAGE, MESH, push(MESH), POSE, tmp_path / "a.jpeg")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_importing_the_package_and_its_files_does_not_import_matplotlib() -> None:
+    code = "import sys, echospline, echospline.io; print(*sorted(m for m in sys.modules if '.' not in m))"
+    modules = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert not {"matplotlib", "SimpleITK", "pydicom", "av"} & set(modules)
