@@ -32,7 +32,9 @@ def test_shipped_image_is_tissue_up_to_its_edges() -> None:
 
 
 def test_shipped_image_has_the_rulers_spacing(recordings: Path) -> None:
-    picture = np.asarray(Image.open(recordings / "timtrack" / "gastroc_jumping_048.png").convert("L")).astype(float)
+    picture = np.asarray(Image.open(recordings / "timtrack" / "gastroc_jumping_048.png").convert("L")).astype(
+        float
+    )
     marked = np.flatnonzero(picture[46] > 100)  # the ruler above the tissue has one block per centimetre
     blocks = np.array([run.mean() for run in np.split(marked, np.flatnonzero(np.diff(marked) > 1) + 1)])[:6]
     per_cm = np.polyfit(np.arange(6), blocks, 1)[0]
@@ -113,7 +115,9 @@ def test_pages_of_a_tiff_are_a_cine_once_their_rate_is_known(tmp_path: Path) -> 
 def test_region_cuts_the_pixels_and_starts_at_zero(recordings: Path) -> None:
     whole = read(recordings / "timtrack" / "gastroc_jumping_048.png", spacing=(0.0866, 0.0866))
     part = read(
-        recordings / "timtrack" / "gastroc_jumping_048.png", spacing=(0.0866, 0.0866), region=(112, 64, 688, 520)
+        recordings / "timtrack" / "gastroc_jumping_048.png",
+        spacing=(0.0866, 0.0866),
+        region=(112, 64, 688, 520),
     )
     np.testing.assert_array_equal(part.pixels, whole.pixels[64:520, 112:688])
     assert part.grid.origin == (0.0, 0.0)
