@@ -1,0 +1,169 @@
+"""The kernel with the anchors already held: G(x, y), the field at x of a unit weight at y that no anchor feels.
+
+    G(x, y) = U(x, y) - [U_xB  P_x] L_B^-1 [U_By  P_y]'
+
+with U the spline's kernel, P its polynomial and L_B the system (6) of the anchors B alone. A spline through the anchors,
+held at zero, and further landmarks C with displacements d is then G_:C w with G_CC w = d: no more than the landmarks that
+move. Factored once per scene.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.linalg import lu_factor, lu_solve
+
+from echospline.errors import InputError
+from echospline.grid import Floats, as_points
+from echospline.mechanics.compiled import add_product
+from echospline.mechanics.kernels import Kernel
+from echospline.mechanics.spline import Spline, compliance
+
+
+@dataclass(frozen=True)
+class AnchoredKernel:
+    """G for one set of anchors and one set of points to evaluate it at.
+
+    Rows stand for sources and columns for points, because rows are what a step reads. With two components (c = 2) a
+    row holds all x, then all y; sources are interleaved (x, y of the first, x, y of the second, ...).
+
+    Parameters
+    ----------
+    kernel : Kernel
+        In conditioned coordinates (x - centre) / scale.
+    anchors, points : ndarray, shape (b, 2) and (n, 2)
+        Conditioned.
+    table : ndarray, shape (b c + p, n c)
+        [U_xB P_x]', what every row needs of the points.
+    factors
+        LU of L_B.
+    centre, scale
+        mm.
+    """
+
+    kernel: Kernel
+    anchors: Floats
+    points: Floats
+    table: Floats
+    factors: Any
+    centre: Floats
+    scale: float
+
+    @classmethod
+    def factor(
+        cls, kernel: Kernel, anchors: ArrayLike, points: Floats, stiffness: ArrayLike | None = None
+    ) -> AnchoredKernel:
+        """Assemble and factor L_B.
+
+        Parameters
+        ----------
+        kernel : Kernel
+            `ThinPlate` or `Elastic`.
+        anchors : array_like, shape (b, 2)
+            mm.
+        points : ndarray, shape (n, 2)
+            Where rows are evaluated (the mesh nodes), mm.
+        stiffness : array_like, shape (b,), optional
+            As in `spline.factor`; infinite holds exactly.
+
+        Raises
+        ------
+        InputError
+            If the anchors alone do not hold the tissue (they lie on one line).
+        """
+        held = as_points(anchors, "anchors")
+        c = kernel.components
+        centre = 0.5 * (held.min(axis=0) + held.max(axis=0))
+        scale = float(np.ptp(held, axis=0).max()) / 2 or 1.0
+        B, x = (held - centre) / scale, (points - centre) / scale
+        conditioned = kernel.scaled(scale)
+        R = conditioned.polynomial(B)
+        singular = np.linalg.svd(R, compute_uv=False)
+        if len(singular) < R.shape[1] or singular[-1] < 1e-9 * singular[0]:
+            raise InputError(
+                f"the {len(held)} anchors do not hold the tissue alone; clamp points off one line, "
+                'or use the solver "refit"'
+            )
+        K = conditioned.matrix(B, B)
+        if stiffness is not None:
+            k = np.broadcast_to(np.asarray(stiffness, dtype=np.float64), (len(held),))
+            if not (k > 0).all():
+                raise InputError(f"every stiffness must be positive (or infinite); got {k.min()}")
+            K = K + np.diag(np.tile(compliance(kernel, k) / scale**kernel.length_power, c))
+        p = R.shape[1]
+        L = np.block([[K, R], [R.T, np.zeros((p, p))]])
+        table = np.ascontiguousarray(np.hstack([conditioned.matrix(x, B), conditioned.polynomial(x)]).T)
+        return cls(conditioned, B, x, table, lu_factor(L, check_finite=False), centre, scale)
+
+    @property
+    def components(self) -> int:
+        """c, 1 or 2."""
+        return self.kernel.components
+
+    def conditioned(self, points: Floats) -> Floats:
+        """Points in mm as (x - centre) / scale."""
+        x: Floats = (points - self.centre) / self.scale
+        return x
+
+    def compliance(self, stiffness: Floats) -> Floats:
+        """Diagonal that a stiffness adds, conditioned; 0 for an infinite one."""
+        added: Floats = compliance(self.kernel, stiffness) / self.scale**self.kernel.length_power
+        return added
+
+    def coupling(self, sources: Floats) -> Floats:
+        """L_B^-1 [U_By P_y]' for conditioned sources (m, 2), shape (b c + p, m c), interleaved columns."""
+        right = np.vstack([self.kernel.matrix(self.anchors, sources), self.kernel.polynomial(sources).T])
+        held: Floats = lu_solve(self.factors, interleaved(right.T, self.components).T, check_finite=False)
+        return held
+
+    def between(self, points: Floats, sources: Floats) -> Floats:
+        """G of conditioned points (n, 2) and sources (m, 2), both interleaved, shape (n c, m c)."""
+        c = self.components
+        direct = interleaved(interleaved(self.kernel.matrix(points, sources), c).T, c).T
+        felt = interleaved(
+            np.hstack([self.kernel.matrix(points, self.anchors), self.kernel.polynomial(points)]), c
+        )
+        G: Floats = direct - felt @ self.coupling(sources)
+        return G
+
+    def rows(self, sources: Floats) -> Floats:
+        """G at all points for conditioned sources (m, 2), shape (m c, n c): one row per source component."""
+        rows = np.ascontiguousarray(interleaved(self.kernel.matrix(sources, self.points), self.components))
+        add_product(rows, np.ascontiguousarray(-self.coupling(sources).T), self.table)
+        return rows
+
+    def spline(self, sources: Floats, weights: Floats) -> Spline:
+        """Return the field of weights (m c, 2 / c) at conditioned sources, anchors included, for any point."""
+        c = self.components
+        held = -self.coupling(sources) @ weights
+        split = len(self.anchors) * c
+        mobile = weights if c == 1 else blocks(weights)
+        anchors = held[:split]
+        every = (
+            np.vstack([anchors, mobile])
+            if c == 1
+            else np.vstack(
+                [anchors[: split // 2], mobile[: len(sources)], anchors[split // 2 :], mobile[len(sources) :]]
+            )
+        )
+        landmarks = np.vstack([self.anchors, sources]) * self.scale + self.centre
+        return Spline(self.kernel, landmarks, every, held[split:], self.centre, self.scale)
+
+
+def interleaved(matrix: Floats, c: int) -> Floats:
+    """Rows in blocks [all x, all y] as rows (x, y) of one point after another."""
+    if c == 1:
+        return matrix
+    n = len(matrix) // 2
+    rows: Floats = matrix.reshape(2, n, matrix.shape[1]).transpose(1, 0, 2).reshape(matrix.shape)
+    return rows
+
+
+def blocks(matrix: Floats) -> Floats:
+    """Inverse of `interleaved` for two components."""
+    n = len(matrix) // 2
+    rows: Floats = matrix.reshape(n, 2, matrix.shape[1]).transpose(1, 0, 2).reshape(matrix.shape)
+    return rows
