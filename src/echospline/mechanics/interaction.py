@@ -1,0 +1,125 @@
+"""How the needle acts on the tissue: tip (12), friction (14)(15), relaxation (16)(17), as pure functions.
+
+Forces never appear: each effect is a displacement of a landmark, in mm. What the paper leaves open (how a
+displacement loads, what withdrawal and tilting do) is read as `docs/theory.md` says.
+"""
+
+from __future__ import annotations
+
+from math import exp
+
+import numpy as np
+
+from echospline.grid import Floats
+from echospline.needle import NeedlePose
+
+
+def friction(distance: Floats, speed: float, alpha1: float, alpha2: float, length: float) -> Floats:
+    """Displacement f along the axis of points at a distance from the shaft, equation (15).
+
+    Parameters
+    ----------
+    distance : ndarray
+        d, distance to the shaft, mm.
+    speed : float
+        v, signed axial speed, mm/s: withdrawal drags the tissue back.
+    alpha1, alpha2 : float
+        s; f does not depend on the time step.
+    length : float
+        Length that makes d dimensionless in the exponential, mm (the paper prints a bare d: 1 mm).
+
+    Returns
+    -------
+    ndarray
+        f, mm.
+    """
+    f: Floats = (alpha1 + alpha2 / (1.0 + np.exp(np.minimum(distance / length, 700.0)))) * speed
+    return f
+
+
+def relax(q: Floats, target: Floats, alpha3: float, dt: float) -> Floats:
+    """Displacement after dt of decay towards a target, equation (16): exact, so halving dt changes nothing.
+
+    Parameters
+    ----------
+    q, target : ndarray
+        mm.
+    alpha3 : float
+        Rate, 1/s.
+    dt : float
+        s.
+    """
+    relaxed: Floats = target + (q - target) * exp(-alpha3 * dt)
+    return relaxed
+
+
+def follow(q: Floats, target: Floats, travel: float) -> Floats:
+    """Move displacements (k, 2) towards their targets, none further than ``travel`` (mm)."""
+    gap = target - q
+    distance = np.hypot(gap[:, 0], gap[:, 1])
+    share = np.minimum(1.0, travel / np.maximum(distance, 1e-300))
+    moved: Floats = q + gap * share[:, None]
+    return moved
+
+
+def load(q: Floats, f: Floats, side: Floats, axis: Floats, alpha3: float, dt: float, travel: float) -> Floats:
+    """New displacements of the landmarks in contact.
+
+    Along the axis a landmark is loaded while friction asks for more than it has in friction's direction; then it
+    follows, by at most the needle's own travel. Otherwise it relaxes towards f, equation (16). Across the axis
+    it follows the shaft.
+
+    Parameters
+    ----------
+    q : ndarray, shape (k, 2)
+        Displacements so far, mm.
+    f : ndarray, shape (k,)
+        Friction displacement along the axis, equation (15), mm.
+    side : ndarray, shape (k, 2)
+        Displacement across the axis that the shaft asks for, mm.
+    axis : ndarray, shape (2,)
+        Unit vector from entry to tip.
+    alpha3, dt : float
+        Rate (1/s) and time (s) of relaxation.
+    travel : float
+        Longest way that a point of the needle has moved in the step, mm; infinite loads at once, as printed.
+
+    Returns
+    -------
+    ndarray, shape (k, 2)
+        mm.
+    """
+    along = q @ axis
+    loading = np.sign(f) * (f - along) > 0
+    relaxed = np.where(loading, along, relax(along, f, alpha3, dt))
+    rested = q + (relaxed - along)[:, None] * axis
+    target = np.where(loading, f, relaxed)[:, None] * axis + side
+    return follow(rested, target, travel)
+
+
+def tip_push(pose: NeedlePose, sigma: float, clearance: float) -> float:
+    """How far the tip pushes the tissue ahead of it: sigma of equation (12), mm.
+
+    While the tip is shallower than sigma the push is the depth itself; towards a clamped edge, which cannot be
+    pushed, it fades over four sigma.
+
+    Parameters
+    ----------
+    pose : NeedlePose
+        Where the needle is.
+    sigma : float
+        mm.
+    clearance : float
+        Distance from the tip to what is clamped, mm; 0 beyond it.
+    """
+    push = min(sigma, pose.depth)
+    near = min(1.0, clearance / (4.0 * sigma)) if sigma > 0 else 0.0
+    return push * near * near * (3.0 - 2.0 * near)
+
+
+def needle_travel(before: NeedlePose, after: NeedlePose) -> float:
+    """Longest way that a point of the shaft has moved between two poses, mm (a straight needle: at one of its ends)."""
+    ends = [
+        np.hypot(b[0] - a[0], b[1] - a[1]) for a, b in ((before.entry, after.entry), (before.tip, after.tip))
+    ]
+    return float(max(ends))
