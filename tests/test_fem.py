@@ -7,8 +7,9 @@ import pytest
 
 from echospline.errors import InputError
 from echospline.grid import RegularGrid
-from echospline.mechanics.fem import FEMModel, NeedleForces
+from echospline.mechanics.fem import FEMModel
 from echospline.mechanics.finite_elements import factor, point_loads, stiffness
+from echospline.mechanics.forces import NeedleForces
 from echospline.needle import Insertion, NeedlePose
 from echospline.tissue import Circle, Region, Tissue
 

@@ -8,12 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from math import exp, isfinite
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from echospline.errors import InputError
 from echospline.grid import Floats, RegularGrid
 from echospline.mechanics.finite_elements import (
     Integration,
@@ -24,46 +22,9 @@ from echospline.mechanics.finite_elements import (
     point_loads,
     stiffness,
 )
+from echospline.mechanics.forces import NeedleForces, check_step, travelled
 from echospline.needle import ZERO_LENGTH, NeedlePose
 from echospline.tissue import Tissue
-
-
-@dataclass(frozen=True)
-class NeedleForces:
-    """What the needle exerts on the tissue.
-
-    Parameters
-    ----------
-    tip : float
-        Cutting force at the tip along the axis while the needle advances, N. It stays while the needle rests and
-        dies away on withdrawal. The paper's F = 0.4 N.
-    friction : float
-        Viscous friction per mm of shaft and per mm/s of axial speed, N s/mm^2. The paper's 1e-5 N s/m is read
-        per mm of shaft: 1e-8 N s/mm^2. At 5 mm/s and 30 mm that is 1.5e-6 N, nothing beside the tip; 1e-3 makes
-        friction (0.15 N) comparable with cutting.
-    alpha3 : float
-        Rate at which friction relaxes once the needle slows, equation (16), 1/s.
-    ramp : float
-        Needle travel over which forces build up, and the tip's dies away, mm: 63 % after one ramp. 0 is at once,
-        the paper's law.
-
-    Raises
-    ------
-    InputError
-        If a number is out of its range.
-    """
-
-    tip: float = 0.4
-    friction: float = 1e-8
-    alpha3: float = 1.0
-    ramp: float = 1.0
-
-    def __post_init__(self) -> None:
-        units = {"tip": "N", "friction": "N s/mm^2", "alpha3": "1/s", "ramp": "mm"}
-        for name, unit in units.items():
-            value = getattr(self, name)
-            if not (isfinite(value) and value >= 0):
-                raise InputError(f"{name} must be zero or a positive number in {unit}; got {value}")
 
 
 @dataclass(frozen=True)
@@ -151,11 +112,11 @@ class FEMModel:
         InputError
             If dt is negative or not finite.
         """
-        if not (isfinite(dt) and dt >= 0):
-            raise InputError(f"dt must be zero or a positive number in s; got {dt}")
-        built = self._built_up(state.pose, pose)
-        friction = relaxing(state.friction, self.friction_loads(pose), built, exp(-self.forces.alpha3 * dt))
-        tip = self._tip_force(state.tip, pose, built)
+        check_step(dt)
+        travel = travelled(state.pose, pose)
+        friction = self.forces.advance_friction(state.friction, self.friction_loads(pose), travel, dt)
+        inside = pose.depth >= ZERO_LENGTH and bool(self.grid.contains(pose.tip)[0])
+        tip = self.forces.advance_tip(state.tip, pose, travel, inside=inside)
         displacement = self.factored.solve(friction + self.tip_loads(pose, tip))
         return FEMState(pose, tip, friction, displacement)
 
@@ -185,44 +146,3 @@ class FEMModel:
         if force == 0 or pose.depth < ZERO_LENGTH or not self.grid.contains(pose.tip)[0]:
             return np.zeros((self.grid.size, 2))
         return point_loads(self.grid, pose.tip, force * np.array(pose.axis))
-
-    def _built_up(self, before: NeedlePose | None, after: NeedlePose) -> float:
-        """Share of a force that is still missing after the needle's travel in this step: exp(-travel / ramp)."""
-        travel = (
-            after.depth
-            if before is None
-            else max(
-                float(np.hypot(*np.subtract(after.tip, before.tip))),
-                float(np.hypot(*np.subtract(after.entry, before.entry))),
-            )
-        )
-        if self.forces.ramp == 0:
-            return 0.0
-        return exp(-travel / self.forces.ramp)
-
-    def _tip_force(self, force: float, pose: NeedlePose, missing: float) -> float:
-        inside = pose.depth >= ZERO_LENGTH and bool(self.grid.contains(pose.tip)[0])
-        if not inside:
-            return 0.0
-        if pose.speed == 0:
-            return force
-        target = self.forces.tip if pose.speed > 0 else 0.0
-        return target + (force - target) * missing
-
-
-def relaxing(q: Floats, target: Floats, missing: float, decay: float) -> Floats:
-    """Nodal loads after a step: those that grow build up with the needle's travel, the others relax, equation (16).
-
-    Parameters
-    ----------
-    q, target : ndarray, shape (n, 2)
-        Loads so far and loads of steady motion, N.
-    missing : float
-        Share still missing of a load that grows.
-    decay : float
-        exp(-alpha3 dt), share left of a load that relaxes.
-    """
-    growing = np.sum((target - q) * target, axis=1, keepdims=True) > 0
-    share = np.where(growing, missing, decay)
-    relaxed: Floats = target + (q - target) * share
-    return relaxed
