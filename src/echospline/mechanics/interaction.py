@@ -82,7 +82,8 @@ def load(q: Floats, f: Floats, side: Floats, axis: Floats, alpha3: float, dt: fl
     alpha3, dt : float
         Rate (1/s) and time (s) of relaxation.
     travel : float
-        Longest way that a point of the needle has moved in the step, mm; infinite loads at once, as printed.
+        Longest way that a point of the needle has moved in the step, mm; infinite is the printed law: at once f
+        while there is friction, relaxation only without.
 
     Returns
     -------
@@ -90,7 +91,7 @@ def load(q: Floats, f: Floats, side: Floats, axis: Floats, alpha3: float, dt: fl
         mm.
     """
     along = q @ axis
-    loading = np.sign(f) * (f - along) > 0
+    loading = (np.sign(f) * (f - along) > 0) | (np.isinf(travel) & (f != 0))
     relaxed = np.where(loading, along, relax(along, f, alpha3, dt))
     rested = q + (relaxed - along)[:, None] * axis
     target = np.where(loading, f, relaxed)[:, None] * axis + side
