@@ -1,0 +1,277 @@
+"""One connection: its stream of bytes, what it may still receive, and why it ended."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from echospline.errors import InputError, ProtocolError
+from echospline.openigtlink.decoder import Decoder
+from echospline.openigtlink.message import Message, Unread, encode
+
+log = logging.getLogger("echospline.openigtlink")
+
+Key = tuple[str, str]
+"""Type and device: of two messages with the same key only the newer matters."""
+
+_SLICE = 16 * 1024
+"""Bytes of one peer handled before the others have their turn."""
+
+
+@dataclass(frozen=True)
+class Patience:
+    """How long a peer may do nothing, and how much may wait for it.
+
+    Parameters
+    ----------
+    partial : float
+        Seconds in the middle of a message before the stream counts as truncated.
+    stall : float
+        Seconds without taking a byte while bytes wait before the peer counts as gone.
+    lost : float
+        Seconds after which the system gives up a connection whose other end no longer answers
+        (keep-alive probes, unacknowledged bytes): the protocol itself has no sign of life.
+    buffer : int
+        Bytes that the system may hold for the peer; more would only hold images that are old already.
+    answers : int
+        Answers to questions that may wait; a peer that asks and never reads is closed.
+    """
+
+    partial: float = 10.0
+    stall: float = 20.0
+    lost: float = 15.0
+    buffer: int = 256 * 1024
+    answers: int = 256
+
+
+class Outgoing:
+    """A message that several peers get: packed once for each header version that is asked for."""
+
+    def __init__(self, message: Message) -> None:
+        self.message = message
+        self._bytes: dict[int, bytes] = {}
+
+    @property
+    def key(self) -> Key:
+        """Type and device."""
+        return self.message.type, self.message.device
+
+    def packed(self, version: int) -> bytes:
+        """Bytes for a peer that understands header ``version``."""
+        if version not in self._bytes:
+            self._bytes[version] = encode(self.message, version)
+        return self._bytes[version]
+
+
+class Peer(asyncio.Protocol):
+    """A connected program.
+
+    What is streamed to it waits in one slot per type and device, where a newer message replaces an older
+    one that was not sent yet: a peer that reads slowly skips messages, and no other peer notices.
+
+    Parameters
+    ----------
+    received : callable
+        Called with (peer, message) for each message.
+    left : callable
+        Called with (peer, reason) once, when the connection is over.
+    joined : callable
+        Called with the peer when the connection stands.
+    patience : Patience
+        Its limits.
+    """
+
+    def __init__(
+        self,
+        joined: Callable[[Peer], None],
+        received: Callable[[Peer, Message], None],
+        left: Callable[[Peer, str], None],
+        patience: Patience,
+    ) -> None:
+        self._joined, self._received, self._left = joined, received, left
+        self._patience = patience
+        self.name = "?"
+        self.version = 1
+        """Header version spoken to it: 1 until it shows that it knows 2."""
+        self.muted: set[str] = set()
+        """Types it asked not to be sent (STP_)."""
+        self.speaks: set[Key] = set()
+        """What it sends itself."""
+        self.messages = 0
+        """Messages received."""
+        self.sent = 0
+        """Messages handed to the system for sending."""
+        self.skipped = 0
+        """Messages that a newer one replaced before they were sent."""
+        self._decoder = Decoder()
+        self._pending = bytearray()
+        self._working = False
+        self._answers: deque[Outgoing] = deque()
+        self._slots: dict[Key, Outgoing] = {}
+        self._writable = True
+        self._transport: asyncio.Transport | None = None
+        self._reason = ""
+        self._complained: set[Key] = set()
+        self._heard = self._moved = 0.0
+        self._waiting = 0
+
+    # ---- what the link asks of it
+
+    def offer(self, outgoing: Outgoing) -> None:
+        """Send as soon as the peer can take it, unless a newer one of its kind comes first."""
+        if outgoing.message.type in self.muted or self._transport is None:
+            return
+        if outgoing.key in self._slots:
+            self.skipped += 1
+        self._slots[outgoing.key] = outgoing
+        self._flush()
+
+    def answer(self, message: Message) -> None:
+        """Send this message, whatever comes after it."""
+        if len(self._answers) >= self._patience.answers:
+            self.close(f"it asked {len(self._answers)} questions and read no answer")
+            return
+        self._answers.append(Outgoing(message))
+        self._flush()
+
+    def close(self, reason: str, *, politely: bool = False) -> None:
+        """End the connection; ``politely`` sends what waits first."""
+        if self._transport is None:
+            return
+        self._reason = self._reason or reason
+        if politely:
+            self._transport.close()
+        else:
+            self._transport.abort()
+
+    def check(self, now: float) -> None:
+        """Close the connection if the peer has done nothing for too long (called every second or so)."""
+        if self._transport is None:
+            return
+        if self._decoder.waiting_for and now - self._heard > self._patience.partial:
+            self.close(
+                f"truncated: {self._patience.partial:g} s without the rest of {self._decoder.waiting_for}"
+            )
+        waiting = self._transport.get_write_buffer_size()
+        if waiting == 0 or waiting != self._waiting:
+            self._waiting, self._moved = waiting, now
+        elif now - self._moved > self._patience.stall:
+            self.close(f"stalled: it took no byte for {self._patience.stall:g} s while {waiting} waited")
+
+    # ---- what asyncio tells it
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Begin."""
+        assert isinstance(transport, asyncio.Transport)
+        self._transport = transport
+        # above one byte the transport says stop: the newest message then waits in its slot, not in a queue
+        transport.set_write_buffer_limits(high=0)
+        self._set_socket(transport.get_extra_info("socket"))
+        host, port, *_ = transport.get_extra_info("peername") or ("?", 0)
+        self.name = f"{host}:{port}"
+        self._heard = self._moved = asyncio.get_running_loop().time()
+        self._joined(self)
+
+    def _set_socket(self, connection: socket.socket) -> None:
+        p = self._patience
+        options = [
+            (socket.SOL_SOCKET, "SO_KEEPALIVE", 1),
+            (socket.SOL_SOCKET, "SO_SNDBUF", p.buffer // 2),  # Linux takes the number twice
+            (socket.IPPROTO_TCP, "TCP_NODELAY", 1),
+            (socket.IPPROTO_TCP, "TCP_KEEPIDLE", max(1, round(p.lost / 3))),
+            (socket.IPPROTO_TCP, "TCP_KEEPINTVL", max(1, round(p.lost / 6))),
+            (socket.IPPROTO_TCP, "TCP_KEEPCNT", 4),
+            (socket.IPPROTO_TCP, "TCP_USER_TIMEOUT", round(p.lost * 1000)),
+        ]
+        for level, name, value in options:
+            if hasattr(socket, name):  # not every system has all of them
+                connection.setsockopt(level, getattr(socket, name), value)
+
+    def data_received(self, data: bytes) -> None:
+        """Take bytes."""
+        self._heard = asyncio.get_running_loop().time()
+        self._pending += data
+        if not self._working:
+            self._work()
+
+    def _work(self) -> None:
+        self._working = False
+        if self._transport is None or self._transport.is_closing():
+            return
+        piece = bytes(self._pending[:_SLICE])
+        del self._pending[:_SLICE]
+        try:
+            messages, fault = self._decoder.feed(piece), None
+        except ProtocolError as error:
+            messages, fault = self._decoder.complete, error
+        for message in messages:
+            self._take(message)
+        if fault is not None:
+            self.close(str(fault))
+        elif self._pending:
+            self._working = True
+            self._transport.pause_reading()
+            asyncio.get_running_loop().call_soon(self._work)
+        elif not self._transport.is_closing():
+            self._transport.resume_reading()
+
+    def _take(self, message: Message) -> None:
+        self.messages += 1
+        self.version = max(self.version, min(message.version, 2))
+        content = message.content
+        if isinstance(content, Unread):
+            kind = (content.type, content.reason)
+            if kind not in self._complained and len(self._complained) < 100:
+                self._complained.add(kind)
+                what = content.reason or "echospline does not know this type"
+                log.warning(
+                    "a %s of %s from %s is passed over: %s", content.type, message.device, self.name, what
+                )
+            return
+        if len(self.speaks) < 1000:
+            self.speaks.add((message.type, message.device))
+        try:
+            self._received(self, message)
+        except InputError as error:
+            log.warning("a %s of %s from %s is refused: %s", message.type, message.device, self.name, error)
+
+    def pause_writing(self) -> None:
+        """Hold further messages: the system has no room."""
+        self._writable = False
+
+    def resume_writing(self) -> None:
+        """Go on sending."""
+        self._writable = True
+        self._flush()
+
+    def _flush(self) -> None:
+        transport = self._transport
+        while transport is not None and self._writable and not transport.is_closing():
+            if self._answers:
+                outgoing = self._answers.popleft()
+            elif self._slots:
+                outgoing = self._slots.pop(next(iter(self._slots)))
+            else:
+                return
+            self.sent += 1
+            transport.write(outgoing.packed(self.version))
+
+    def eof_received(self) -> bool:
+        """Close: nothing more will come."""
+        unfinished = self._decoder.waiting_for
+        self._reason = self._reason or (
+            f"it closed in the middle of {unfinished}" if unfinished else "it closed the connection"
+        )
+        return False
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """End."""
+        self._transport = None
+        self._slots.clear()
+        self._answers.clear()
+        self._pending.clear()
+        self._left(self, self._reason or (str(exc) if exc else "closed"))
