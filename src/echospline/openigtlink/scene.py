@@ -209,12 +209,21 @@ class TrackedNeedle:
         back = min((y - skin) / dy, reach.shaft) if dy > 0 else reach.shaft
         return NeedlePose((x - back * dx, y - back * dy), (x, y))
 
-    def seen(self, reach: Reach) -> Visible | None:
-        """What the beam shows of the needle; None if it is outside.
+    def seen(self, skin: float, reach: Reach) -> Visible | None:
+        """What the beam shows of the needle; None if it is outside, or not yet below the skin.
 
         A needle that crosses the plane ends in the picture where it leaves the beam: its true tip is out of
         sight, as at the bedside.
+
+        Parameters
+        ----------
+        skin : float
+            Depth of the image's first row, mm.
+        reach : Reach
+            The beam's thickness.
         """
+        if self.tip[1] <= skin:
+            return None
         z, dz = self.tip[2], self.direction[2]
         half = reach.thickness / 2 * sqrt(log(1 / DRAWN) / log(2))
         # going back from the tip by s, the distance from the plane is z - s dz
@@ -242,8 +251,8 @@ class Visible:
     brightness: float
 
     def of(self, pose: NeedlePose) -> NeedlePose:
-        """Return this piece of a needle, at most down from its entry; of depth 0 if it has none."""
+        """Return this piece of a needle; of depth 0 if it lies above the entry."""
         (x, y), (ax, ay) = pose.tip, pose.axis if pose.depth > 0 else (0.0, 1.0)
-        far = min(self.far, max(pose.depth, self.near + CROSS_SECTION))
-        near = min(self.near, far)
+        near = min(self.near, pose.depth)
+        far = near if near < self.near else min(self.far, max(pose.depth, near + CROSS_SECTION))
         return NeedlePose((x - far * ax, y - far * ay), (x - near * ax, y - near * ay), pose.speed)
