@@ -21,7 +21,7 @@ class UltrasoundImage:
     Parameters
     ----------
     pixels : ndarray, shape (rows, columns) or (rows, columns, 3)
-        [depth, lateral], grey or RGB, any integer or float type; row 0 is the probe's face.
+        [depth, lateral], grey, RGB or RGBA, any integer or float type; row 0 is the probe's face.
     grid : RegularGrid
         Pixel centres in mm; ``grid.shape == (columns, rows)``.
     source : str
@@ -45,7 +45,9 @@ class UltrasoundImage:
         """Wrap an array; ``spacing`` is (lateral, depth) in mm and pixel [0, 0] lies at (0, 0) mm."""
         pixels = np.asarray(pixels)
         if pixels.ndim not in (2, 3):
-            raise InputError(f"an image has shape (rows, columns) or (rows, columns, 3); got {pixels.shape}")
+            raise InputError(
+                f"an image has shape (rows, columns) or (rows, columns, 3 or 4); got {pixels.shape}"
+            )
         return cls(pixels, RegularGrid((pixels.shape[1], pixels.shape[0]), spacing), source)
 
     @property
@@ -104,8 +106,8 @@ class Cine:
 
 
 def _check_pixels(shape: tuple[int, ...], grid: RegularGrid) -> None:
-    if len(shape) not in (2, 3) or (len(shape) == 3 and shape[2] != 3):
-        raise InputError(f"an image has shape (rows, columns) or (rows, columns, 3); got {shape}")
+    if len(shape) not in (2, 3) or (len(shape) == 3 and shape[2] not in (3, 4)):
+        raise InputError(f"an image has shape (rows, columns) or (rows, columns, 3 or 4); got {shape}")
     if (shape[1], shape[0]) != grid.shape:
         raise InputError(
             f"an image of {shape[0]} rows and {shape[1]} columns needs a grid of shape "

@@ -12,6 +12,8 @@ from numpy.typing import ArrayLike
 from echospline.errors import InputError
 from echospline.grid import Floats, as_points
 
+SAME_TIME = 1e-9
+"""s; times closer than this are one: k / fps and a keyframe meet in spite of rounding."""
 ZERO_LENGTH = 1e-9
 """mm; a needle shorter than this has no direction, touches nothing and pushes nothing."""
 
@@ -201,12 +203,12 @@ class Insertion:
         insertion still moves and the first step of a rest does not.
         """
         k = self.times
-        i = int(np.clip(np.searchsorted(k, t, side="left"), 1, len(k) - 1))
+        i = int(np.clip(np.searchsorted(k, t - SAME_TIME, side="left"), 1, len(k) - 1))
         step = k[i] - k[i - 1]
         a = float(np.clip((t - k[i - 1]) / step, 0.0, 1.0))
         entry = (1 - a) * self.entry[i - 1] + a * self.entry[i]
         tip = (1 - a) * self.tip[i - 1] + a * self.tip[i]
-        moving = k[0] < t <= k[-1]
+        moving = k[0] < t <= k[-1] + SAME_TIME
         along = tip - entry
         length = float(np.hypot(*along))
         axis = along / length if length > ZERO_LENGTH else self._axis_near(i)
