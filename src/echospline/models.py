@@ -1,0 +1,58 @@
+"""Where the words "tps", "elastic" and "fem" become classes: imported by the command line and the study alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from echospline.errors import InputError
+from echospline.grid import RegularGrid
+from echospline.mechanics.fem import FEMModel
+from echospline.mechanics.forces import NeedleForces
+from echospline.mechanics.kernels import Elastic, ThinPlate
+from echospline.mechanics.model import TissueModel
+from echospline.mechanics.tps import TPSModel, TPSParameters
+from echospline.scenario import Scenario
+
+MODELS = ("tps", "elastic", "fem")
+
+
+def build_model(
+    scenario: Scenario, grid: RegularGrid, *, kind: str | None = None, folder: Path | None = None
+) -> TissueModel[Any]:
+    """Build the tissue model that a scenario asks for.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Its [tissue], [mesh] and [model].
+    grid : RegularGrid
+        The mesh.
+    kind : {"tps", "elastic", "fem"}, optional
+        Another model than the scenario's, for the same scene.
+    folder : Path, optional
+        Where relative paths of the scenario start; the working folder when not given.
+
+    Raises
+    ------
+    InputError
+        If there is no such model or its parameters do not make one.
+    """
+    kind = kind or scenario.model.kind
+    tissue = scenario.make_tissue(folder or Path(), grid)
+    clamped, points = scenario.mesh.clamped, scenario.mesh.clamped_points
+    if kind == "fem":
+        if points:
+            raise InputError(
+                "mesh.clamped_points: fem clamps whole edges; leave the points out or choose tps"
+            )
+        return FEMModel(grid, clamped, tissue, NeedleForces(**scenario.model.forces.model_dump()))
+    parameters = TPSParameters(**scenario.model.landmarks.model_dump())
+    if kind == "tps":
+        return TPSModel(grid, clamped, parameters, ThinPlate(), clamped_points=points)
+    if kind == "elastic":
+        section = scenario.model.elastic
+        nu = tissue.poisson if section.poisson is None else section.poisson
+        kernel = Elastic(min(nu, 0.499), section.radius, tissue.plane)
+        return TPSModel(grid, clamped, parameters, kernel, clamped_points=points)
+    raise InputError(f"a model is one of {', '.join(MODELS)}; got {kind!r}")
