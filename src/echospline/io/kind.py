@@ -27,6 +27,8 @@ _PICTURES = {
 }
 _STRANGERS = {
     b"%PDF": "a PDF document",
+    b"\x08\x00\x05\x00": "DICOM without its preamble (convert it to a DICOM part 10 file)",
+    b"\x08\x00\x00\x00": "DICOM without its preamble (convert it to a DICOM part 10 file)",
     b"PK\x03\x04": "a zip archive",
     b"\x89HDF\r\n\x1a\n": "an HDF5 file (Matlab 7.3 files are such)",
     b"MATLAB 5.0": "a Matlab file",
@@ -93,13 +95,14 @@ def kind_of(path: Path) -> tuple[Kind, str]:
 
 
 def _by_magic(start: bytes) -> tuple[Kind, str] | None:
+    # First DICOM: its free 128 bytes before the mark may hold a TIFF header.
+    if start[128:132] == b"DICM":
+        return "dicom", "DICOM"
     for magic, name in _PICTURES.items():
         if start.startswith(magic):
             return "picture", name
     if start[:6] in (b"GIF87a", b"GIF89a"):
         return "gif", "GIF"
-    if start[128:132] == b"DICM":
-        return "dicom", "DICOM"
     return ("nrrd", "NRRD") if start.startswith(b"NRRD0") else None
 
 

@@ -53,7 +53,7 @@ def open_picture(path: Path, format: str, limit: float) -> Recording:
         delays = [_delay(page) for page in ImageSequence.Iterator(image)] if format in ("GIF", "PNG") else []
         rows, columns = image.height, image.width
 
-    def decode(frame: int | None) -> Iterator[Pixels]:
+    def decode(frame: int | None, colour: bool) -> Iterator[Pixels]:
         with decoding(path, format), _opened(path, format, limit) as image:
             for i in range(frames) if frame is None else (frame,):
                 image.seek(i)

@@ -27,14 +27,14 @@ class CineStream:
     ----------
     grid : RegularGrid
         Pixel centres in mm, the same for every frame.
-    frames : int or None
-        Number of frames; None when only decoding can tell.
+    frames : int
+        Number of frames.
     source : str
         File, format and what the reader had to work out.
     """
 
     grid: RegularGrid
-    frames: int | None
+    frames: int
     source: str
     _recording: Recording
     _box: Box
@@ -44,7 +44,7 @@ class CineStream:
 
     def __iter__(self) -> Iterator[tuple[float, UltrasoundImage]]:
         """Yield (time in s since the first frame, image)."""
-        for i, pixels in enumerate(self._recording.decode(None)):
+        for i, pixels in enumerate(self._recording.decode(None, self._colour)):
             time = (
                 i / self._fps if self._fps else float(self._times[i]) if self._times is not None else float(i)
             )
@@ -85,7 +85,7 @@ def read(
     Returns
     -------
     UltrasoundImage or Cine
-        Pixel [0, 0] of the region lies at (0, 0) mm unless the file gives an origin of its own.
+        Pixel [0, 0] of the region lies at (0, 0) mm.
 
     Raises
     ------
@@ -94,13 +94,13 @@ def read(
     """
     if str(path).startswith(SAMPLE):
         return _sample(str(path).removeprefix(SAMPLE), spacing, region)
-    recording = open_recording(path, limit)
+    recording = open_recording(path, limit, whole=frame is None)
     box = _checked_box(recording, region)
     grid = _grid(recording, box, spacing)
     source = _source(recording)
     if recording.single or frame is not None:
         index = _checked_frame(recording, frame or 0)
-        pixels = next(recording.decode(index))
+        pixels = next(recording.decode(index, colour))
         return UltrasoundImage(_cropped(pixels, box, colour), grid, source)
     frames = _gather(recording, box, colour, limit)
     return Cine(frames, _times(recording, fps, len(frames)), grid, source)
@@ -164,6 +164,18 @@ def open_recording(path: str | Path, limit: float = LIMIT, *, whole: bool = True
         from echospline.io.picture import open_picture  # noqa: PLC0415
 
         recording = open_picture(path, name, header_limit)
+    elif kind == "dicom":
+        from echospline.io.dicom import open_dicom  # noqa: PLC0415
+
+        recording = open_dicom(path, header_limit)
+    elif kind in ("metaimage", "nrrd", "nifti"):
+        from echospline.io.volume import open_volume  # noqa: PLC0415
+
+        recording = open_volume(path, kind, name, limit, whole=whole)
+    elif kind == "video":
+        from echospline.io.video import open_video  # noqa: PLC0415
+
+        recording = open_video(path, name, header_limit)
     elif kind == "displacement":
         raise InputError(
             f"{path} holds arrays (npz), not pictures; expected {READABLE}: use read_displacement"
@@ -213,10 +225,7 @@ def _grid(recording: Recording, box: Box, spacing: Sequence[float] | None) -> Re
     if len(found) != 2:
         raise InputError(f"spacing must be two positive numbers in mm (lateral, depth); got {found}")
     dx, dy = found
-    x, y = recording.origin
-    return RegularGrid(
-        shape, (dx, dy), (x, y) if recording.region is None and box[:2] == (0, 0) else (0.0, 0.0)
-    )
+    return RegularGrid(shape, (dx, dy))
 
 
 def _source(recording: Recording) -> str:
@@ -263,21 +272,28 @@ def _times(recording: Recording, fps: float | None, count: int) -> Floats:
 def _cropped(pixels: Pixels, box: Box, colour: bool) -> Pixels:
     left, top, right, bottom = box
     part = pixels[top:bottom, left:right]
+    if part.dtype.kind == "f" and not np.isfinite(part).all():
+        raise InputError("the picture holds values that are not finite (NaN or infinity): replace them first")
     return np.ascontiguousarray(part if colour else to_grey(part))
 
 
 def _gather(recording: Recording, box: Box, colour: bool, limit: float) -> Pixels:
-    """Decode all frames into one array; a file that holds more than it declares is stopped at the limit."""
-    frames: list[Pixels] = []
-    size = 0
-    for pixels in recording.decode(None):
-        frames.append(_cropped(pixels, box, colour))
-        size += frames[-1].nbytes
-        if size > limit * MIB:
+    """Decode all frames into one array; a file that holds other than it declares is refused."""
+    frames: Pixels | None = None
+    count = 0
+    for pixels in recording.decode(None, colour):
+        part = _cropped(pixels, box, colour)
+        if (count + 1) * part.nbytes > limit * MIB:
             raise InputError(
                 f"{recording.path} holds more than {limit:,.0f} MiB of pixels: take one frame, open it with "
                 "open_cine, or raise the limit"
             )
-    if not frames:
-        raise InputError(f"{recording.path} holds no frame that can be decoded")
-    return np.stack(frames)
+        if frames is None:
+            frames = np.empty((recording.frames, *part.shape), part.dtype)
+        if count == len(frames) or part.shape != frames.shape[1:]:
+            raise InputError(f"{recording.path} holds other frames than it declares: it is damaged")
+        frames[count] = part
+        count += 1
+    if frames is None or count < len(frames):
+        raise InputError(f"{recording.path} declares {recording.frames} frames but holds {count}: it is cut short")
+    return frames

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -21,6 +22,8 @@ LIMIT = 2048.0
 """MiB of decoded pixels that a reader takes unless told otherwise."""
 
 MIB = 2**20
+_ITK_PREFIX = re.compile(r"(?s)^.*itk::?ERROR: \w+\(0x[0-9a-f]+\): |^.*ITK ERROR: \w+\(0x[0-9a-f]+\): ")
+"""Source lines and addresses that ITK puts before what it has to say."""
 LUMA = np.array([0.299, 0.587, 0.114])
 """Weights of red, green and blue in grey: ITU-R BT.601, the matrix of DICOM's YBR_FULL too."""
 
@@ -56,19 +59,17 @@ class Recording:
         Name of the format, for people.
     rows, columns : int
         Size of one frame.
-    frames : int or None
-        Number of frames; None when only decoding can tell.
+    frames : int
+        Number of frames.
     channels : int
         1 (grey) or 3 (RGB).
     dtype : dtype
         Of the decoded pixels.
     decode : callable
-        ``decode(None)`` yields every frame, ``decode(i)`` frame i alone, each
-        (rows, columns) or (rows, columns, 3).
+        ``decode(None, colour)`` yields every frame, ``decode(i, colour)`` frame i alone, each
+        (rows, columns) or (rows, columns, 3); without ``colour`` a decoder may give grey where that is quicker.
     spacing : (lateral, depth), optional
         mm per pixel, where the file says so.
-    origin : (x, y)
-        Position of the first pixel's centre in mm, where the file says so.
     region : Box, optional
         Where the tissue is; the whole frame when None.
     regions : tuple of Region
@@ -85,12 +86,11 @@ class Recording:
     format: str
     rows: int
     columns: int
-    frames: int | None
+    frames: int
     channels: int
     dtype: np.dtype[Any]
-    decode: Callable[[int | None], Iterator[Pixels]] = field(repr=False)
+    decode: Callable[[int | None, bool], Iterator[Pixels]] = field(repr=False)
     spacing: tuple[float, float] | None = None
-    origin: tuple[float, float] = (0.0, 0.0)
     region: Box | None = None
     regions: tuple[Region, ...] = ()
     times: Floats | None = None
@@ -137,7 +137,8 @@ def to_grey(pixels: Pixels) -> Pixels:
     """Luma of an RGB frame in its own type, rounded; a grey frame as it is."""
     if pixels.ndim == 2:
         return pixels
-    grey: Pixels = pixels.astype(np.float64) @ LUMA
+    kind = np.float32 if pixels.dtype.itemsize == 1 else np.float64
+    grey: Pixels = pixels.astype(kind) @ LUMA.astype(kind)
     return (np.rint(grey) if np.issubdtype(pixels.dtype, np.integer) else grey).astype(pixels.dtype)
 
 
@@ -157,7 +158,7 @@ def decoding(path: Path, what: str) -> Iterator[None]:
             f"{path} needs more memory than there is: take one frame or a smaller file"
         ) from None
     except Exception as error:
-        reason = " ".join(str(error).split())[:160] or type(error).__name__
+        reason = " ".join(_ITK_PREFIX.sub("", str(error)).split())[:160] or type(error).__name__
         raise InputError(
             f"{path} is damaged or cut short: expected a whole {what} file, but its decoder says: {reason}"
         ) from error
