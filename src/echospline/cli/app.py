@@ -6,6 +6,7 @@ import sys
 
 import typer
 
+from echospline.cli.info import info
 from echospline.errors import EchosplineError
 
 app = typer.Typer(
@@ -21,6 +22,9 @@ app = typer.Typer(
 @app.callback()
 def _main() -> None:
     pass
+
+
+app.command()(info)
 
 
 def main() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,7 +23,7 @@ from pydicom.uid import DeflatedExplicitVRLittleEndian, JPEGBaseline8Bit, JPEGEx
 from echospline.errors import InputError, MissingExtraError
 from echospline.grid import Floats
 from echospline.image import Pixels
-from echospline.io.recording import MIB, Box, Recording, Region, check_size, decoding
+from echospline.io.recording import MIB, Box, Recording, Region, check_size, decoding, quietly
 
 _CENTIMETRE = 3
 """Code of cm in Physical Units X/Y Direction (0018,6024/6026)."""
@@ -92,8 +93,8 @@ def open_dicom(path: Path, limit: float) -> Recording:
 
     def decode(frame: int | None, colour: bool) -> Iterator[Pixels]:
         count = 0
-        with decoding(path, "DICOM"), _quiet():
-            for raw in _raw_frames(path, deflated, frame, mislabelled):
+        with decoding(path, "DICOM"):
+            for raw in quietly(_raw_frames(path, deflated, frame, mislabelled), _quiet):
                 pixels = _upright(raw if table is None else _coloured(raw, table), colours, header)
                 if pixels.shape[:2] != (rows, columns):
                     raise InputError(
@@ -127,10 +128,16 @@ def _coloured(indices: Pixels, header: pydicom.Dataset) -> Pixels:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Pydicom warns of every oddity of a header; those that matter here become notes or errors."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
+    """Pydicom warns and logs every oddity of a header; those that matter here become notes or errors."""
+    logger = logging.getLogger("pydicom")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.setLevel(level)
 
 
 def _check_deflated(path: Path, limit: float) -> None:

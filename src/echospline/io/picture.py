@@ -12,7 +12,7 @@ from PIL import Image, ImageSequence
 
 from echospline.errors import InputError
 from echospline.image import Pixels
-from echospline.io.recording import Recording, check_size, decoding
+from echospline.io.recording import Recording, check_size, decoding, quietly
 
 _DEEP = {"I;16": np.uint16, "I;16L": np.uint16, "I;16B": np.uint16, "I": np.int32, "F": np.float32}
 """Grey of more than 8 bits keeps its values."""
@@ -39,7 +39,7 @@ def open_picture(path: Path, format: str, limit: float) -> Recording:
     InputError
         If the file is damaged, too large or of a pixel type that is no picture.
     """
-    with decoding(path, format), _opened(path, format, limit) as image:
+    with decoding(path, format), _quiet(), _opened(path, format) as image:
         mode = image.mode
         if mode not in _DEEP and mode not in _GREY and mode not in _COLOUR:
             raise InputError(
@@ -54,10 +54,14 @@ def open_picture(path: Path, format: str, limit: float) -> Recording:
         rows, columns = image.height, image.width
 
     def decode(frame: int | None, colour: bool) -> Iterator[Pixels]:
-        with decoding(path, format), _opened(path, format, limit) as image:
-            for i in range(frames) if frame is None else (frame,):
-                image.seek(i)
-                yield _pixels(image, path, (rows, columns), channels, dtype)
+        def pages() -> Iterator[Pixels]:
+            with _opened(path, format) as image:
+                for i in range(frames) if frame is None else (frame,):
+                    image.seek(i)
+                    yield _pixels(image, path, (rows, columns), channels, dtype)
+
+        with decoding(path, format):
+            yield from quietly(pages(), _quiet)
 
     notes = []
     times = None
@@ -74,16 +78,21 @@ def open_picture(path: Path, format: str, limit: float) -> Recording:
 
 
 @contextmanager
-def _opened(path: Path, format: str, limit: float) -> Iterator[Image.Image]:
-    """Open with Pillow's own guard against decompression bombs replaced by ours, which has a clearer unit."""
+def _opened(path: Path, format: str) -> Iterator[Image.Image]:
+    """Open with one decoder alone; Pillow's own guard against decompression bombs becomes our sentence."""
+    try:
+        with Image.open(path, formats=(format,)) as image:
+            yield image
+    except Image.DecompressionBombError as error:
+        raise InputError(f"{path} declares more pixels than a picture can have: {error}") from error
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Pillow warns of large pictures (our limit decides) and of odd tags (which are not used)."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-        warnings.filterwarnings("ignore", module=r"PIL\.")
-        try:
-            with Image.open(path, formats=(format,)) as image:
-                yield image
-        except Image.DecompressionBombError as error:
-            raise InputError(f"{path} declares more pixels than a picture can have: {error}") from error
+        warnings.simplefilter("ignore")
+        yield
 
 
 def _pixels(

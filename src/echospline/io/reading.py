@@ -48,7 +48,12 @@ class CineStream:
             time = (
                 i / self._fps if self._fps else float(self._times[i]) if self._times is not None else float(i)
             )
-            yield time, UltrasoundImage(_cropped(pixels, self._box, self._colour), self.grid, self.source)
+            yield (
+                time,
+                UltrasoundImage(
+                    _cropped(self._recording.path, pixels, self._box, self._colour), self.grid, self.source
+                ),
+            )
 
 
 def read(
@@ -101,7 +106,7 @@ def read(
     if recording.single or frame is not None:
         index = _checked_frame(recording, frame or 0)
         pixels = next(recording.decode(index, colour))
-        return UltrasoundImage(_cropped(pixels, box, colour), grid, source)
+        return UltrasoundImage(_cropped(recording.path, pixels, box, colour), grid, source)
     frames = _gather(recording, box, colour, limit)
     return Cine(frames, _times(recording, fps, len(frames)), grid, source)
 
@@ -233,12 +238,6 @@ def _source(recording: Recording) -> str:
 
 
 def _checked_frame(recording: Recording, frame: int) -> int:
-    if recording.frames is None:
-        if frame < 0:
-            raise InputError(
-                f"{recording.path} does not say how many frames it has: count frames from the first"
-            )
-        return frame
     if not -recording.frames <= frame < recording.frames:
         raise InputError(
             f"{recording.path} has {recording.frames} frames, counted from 0; got frame {frame}: "
@@ -269,11 +268,11 @@ def _times(recording: Recording, fps: float | None, count: int) -> Floats:
     return recording.times[:count]
 
 
-def _cropped(pixels: Pixels, box: Box, colour: bool) -> Pixels:
+def _cropped(path: Path, pixels: Pixels, box: Box, colour: bool) -> Pixels:
     left, top, right, bottom = box
     part = pixels[top:bottom, left:right]
     if part.dtype.kind == "f" and not np.isfinite(part).all():
-        raise InputError("the picture holds values that are not finite (NaN or infinity): replace them first")
+        raise InputError(f"{path} holds values that are not finite (NaN or infinity): replace them first")
     return np.ascontiguousarray(part if colour else to_grey(part))
 
 
@@ -282,7 +281,7 @@ def _gather(recording: Recording, box: Box, colour: bool, limit: float) -> Pixel
     frames: Pixels | None = None
     count = 0
     for pixels in recording.decode(None, colour):
-        part = _cropped(pixels, box, colour)
+        part = _cropped(recording.path, pixels, box, colour)
         if (count + 1) * part.nbytes > limit * MIB:
             raise InputError(
                 f"{recording.path} holds more than {limit:,.0f} MiB of pixels: take one frame, open it with "
@@ -295,5 +294,7 @@ def _gather(recording: Recording, box: Box, colour: bool, limit: float) -> Pixel
         frames[count] = part
         count += 1
     if frames is None or count < len(frames):
-        raise InputError(f"{recording.path} declares {recording.frames} frames but holds {count}: it is cut short")
+        raise InputError(
+            f"{recording.path} declares {recording.frames} frames but holds {count}: it is cut short"
+        )
     return frames

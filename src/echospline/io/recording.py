@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -97,11 +97,6 @@ class Recording:
     single: bool = False
     notes: tuple[str, ...] = ()
 
-    @property
-    def frame_bytes(self) -> int:
-        """Bytes of one decoded frame."""
-        return self.rows * self.columns * self.channels * self.dtype.itemsize
-
     def spacing_of(self, box: Box) -> tuple[float, float] | None:
         """Return the spacing in mm of the region that holds a box's centre; the file's own outside of all."""
         x, y = (box[0] + box[2]) / 2, (box[1] + box[3]) / 2
@@ -162,3 +157,13 @@ def decoding(path: Path, what: str) -> Iterator[None]:
         raise InputError(
             f"{path} is damaged or cut short: expected a whole {what} file, but its decoder says: {reason}"
         ) from error
+
+
+def quietly(frames: Iterator[Pixels], quiet: Callable[[], AbstractContextManager[None]]) -> Iterator[Pixels]:
+    """Decode each frame inside of ``quiet`` and hand it out outside, where warnings are others' business."""
+    while True:
+        with quiet():
+            pixels = next(frames, None)
+        if pixels is None:
+            return
+        yield pixels

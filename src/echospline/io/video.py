@@ -16,8 +16,8 @@ from echospline.io.recording import Recording, check_size, decoding
 
 _DEMUXERS = {"MP4": "mov", "QuickTime": "mov", "AVI": "avi", "Matroska": "matroska", "WebM": "matroska"}
 """The one demuxer tried for each format: others of FFmpeg's follow references to other files."""
-_SLACK = 64
-"""Pixels that codecs may add to each side for their blocks."""
+_SMALLEST_GUARD = 2**22
+"""Pixels a decoder may always use: some begin with a size of their own and take the stream's afterwards."""
 
 
 def open_video(path: Path, format: str, limit: float) -> Recording:
@@ -39,7 +39,7 @@ def open_video(path: Path, format: str, limit: float) -> Recording:
     """
     with decoding(path, format), _opened(path, format) as container:
         if not container.streams.video:
-            raise InputError(f"{path} is {format} without a video stream; expected a cine")
+            raise InputError(f"{path} is {format} without a video stream: it is no cine, or cut short")
         stream = container.streams.video[0]
         codec = stream.codec_context
         rows, columns, name = int(codec.height), int(codec.width), codec.name
@@ -56,7 +56,7 @@ def open_video(path: Path, format: str, limit: float) -> Recording:
         with decoding(path, format), _opened(path, format) as container:
             stream = container.streams.video[0]
             stream.thread_type = "AUTO"
-            stream.codec_context.options = {"max_pixels": str((rows + _SLACK) * (columns + _SLACK))}
+            stream.codec_context.options = {"max_pixels": str(max(2 * rows * columns, _SMALLEST_GUARD))}
             for picture in container.decode(video=0):
                 if picture.is_corrupt or (picture.height, picture.width) != (rows, columns):
                     raise InputError(f"{path} is damaged at frame {count}: copy it again")

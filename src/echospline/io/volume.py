@@ -89,7 +89,7 @@ def open_volume(path: Path, kind: Kind, format: str, limit: float, *, whole: boo
             )
         dtype = _DTYPES[type_name]
         tags = {key: reader.GetMetaData(key) for key in reader.GetMetaDataKeys()}
-        listed = channels > 1 and "list" in tags.get("NRRD_kinds[0]", "")
+        listed = channels > 1 and kind == "nrrd" and fields.get("kinds", "").lower().startswith("list")
         axes = [i for i, n in enumerate(size) if n > 1 or i < 2]
         if len(axes) > 3 or len(size) < 2 or (listed and len(axes) > 2):
             raise InputError(f"{path} has {len(size)} axes of {size}; expected an image (2) or a cine (3)")

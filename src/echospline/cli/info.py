@@ -1,0 +1,247 @@
+"""``echospline info``: what a file holds, before anything is done with it."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from echospline.data import SAMPLES, sample_image
+from echospline.errors import InputError
+from echospline.io.displacement import displacement_shapes, read_displacement
+from echospline.io.kind import head, kind_of
+from echospline.io.reading import SAMPLE, open_recording
+from echospline.io.recording import LIMIT, MIB, Recording
+
+_TOML_LIMIT = 2**20
+"""Bytes; a scenario is a page or two."""
+
+
+def info(
+    file: Annotated[
+        str,
+        typer.Argument(
+            help="Image, cine, DICOM, displacement.npz or scenario; sample:calf is the image that ships with echospline.",
+            show_default=False,
+        ),
+    ],
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON object instead of a table.")
+    ] = False,
+    limit: Annotated[
+        float,
+        typer.Option(
+            min=1, metavar="MIB", help="Largest decoded size that is still called readable, in MiB."
+        ),
+    ] = LIMIT,
+) -> None:
+    """Say what a file holds: format, pixels, spacing, size in mm, frames and times, and what to doubt."""
+    found = describe(file, limit)
+    if as_json:
+        print(json.dumps(found, indent=2))
+        return
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column(overflow="fold")
+    for key, value in found.items():
+        for i, line in enumerate(_lines(key, value)):
+            table.add_row(_label(key) if i == 0 else "", line)
+    Console(highlight=False).print(table, markup=False)
+
+
+def describe(file: str, limit: float = LIMIT) -> dict[str, Any]:
+    """Gather what a file holds, in words and numbers that JSON can carry.
+
+    Parameters
+    ----------
+    file : str
+        Path, or ``sample:NAME``.
+    limit : float
+        MiB of decoded pixels or arrays.
+
+    Returns
+    -------
+    dict
+        Keys end with their unit: ``spacing_mm`` (lateral, depth), ``size_mm`` (width, depth), ``duration_s``.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged, too large or of no known kind.
+    """
+    if file.startswith(SAMPLE):
+        return _of_sample(file.removeprefix(SAMPLE))
+    path = Path(file)
+    kind, name = kind_of(path)
+    about: dict[str, Any] = {"file": str(path), "format": name, "bytes": path.stat().st_size}
+    if kind == "displacement":
+        return about | _of_displacement(path, limit)
+    if kind == "toml":
+        return about | _of_toml(path)
+    return about | _of_recording(open_recording(path, limit))
+
+
+def _of_sample(name: str) -> dict[str, Any]:
+    if name not in SAMPLES:
+        raise InputError(f"there is no sample {name!r}; expected one of: {', '.join(SAMPLES)}")
+    image = sample_image(name)
+    rows, columns = image.pixels.shape[:2]
+    return {
+        "file": f"{SAMPLE}{name}", "format": "PNG, shipped with echospline", "source": SAMPLES[name].source,
+        "pixels": {"columns": columns, "rows": rows, "channels": 1, "type": str(image.pixels.dtype)},
+        "spacing_mm": list(image.spacing), "size_mm": _size(columns, rows, image.spacing), "frames": 1,
+    }  # fmt: skip
+
+
+def _of_recording(recording: Recording) -> dict[str, Any]:
+    left, top, right, bottom = recording.region or (0, 0, recording.columns, recording.rows)
+    about: dict[str, Any] = {
+        "format": recording.format,
+        "pixels": {
+            "columns": recording.columns,
+            "rows": recording.rows,
+            "channels": recording.channels,
+            "type": str(recording.dtype),
+        },
+        "decoded_mib": round(
+            recording.rows * recording.columns * recording.dtype.itemsize * recording.frames / MIB, 2
+        ),
+        "spacing_mm": list(recording.spacing) if recording.spacing else None,
+        "frames": recording.frames,
+    }
+    if recording.region:
+        about["region"] = [left, top, right, bottom]
+    if recording.spacing:
+        about["size_mm"] = _size(right - left, bottom - top, recording.spacing)
+    if recording.frames > 1:
+        times = recording.times
+        last = float(times[-1]) if times is not None else None
+        about["duration_s"] = round(last, 6) if last is not None else None
+        about["fps"] = round((recording.frames - 1) / last, 3) if last else None
+    if recording.regions:
+        about["regions"] = [
+            {"content": r.content, "box": list(r.box), "spacing_mm": list(r.spacing) if r.spacing else None}
+            for r in recording.regions
+        ]
+    about["notes"] = [*recording.notes, *_missing(recording)]
+    return about
+
+
+def _missing(recording: Recording) -> list[str]:
+    notes = []
+    if recording.spacing is None:
+        notes.append("no spacing: give --spacing LAT,DEPTH in mm per pixel")
+    if recording.frames > 1 and recording.times is None:
+        notes.append("no frame times: give --fps in frames per second, or --frame to take one")
+    return notes
+
+
+def _of_displacement(path: Path, limit: float) -> dict[str, Any]:
+    shapes = displacement_shapes(path)
+    record = read_displacement(path, limit=limit)
+    moved = np.hypot(record.displacement[..., 0], record.displacement[..., 1])
+    depth = np.hypot(*(record.tip - record.entry).T)
+    about: dict[str, Any] = {
+        "arrays": {name: list(shape) for name, shape in shapes.items()},
+        "nodes": len(record.points),
+        "frames": len(record),
+        "notes": [],
+    }
+    try:
+        about["mesh"] = list(record.grid().shape)
+    except InputError:
+        about["notes"].append("the points are no regular grid")
+    if len(record):
+        last = float(record.times[-1] - record.times[0])
+        about["duration_s"] = round(last, 6)
+        about["largest_displacement_mm"] = round(float(moved.max()), 6)
+        about["deepest_insertion_mm"] = round(float(depth.max()), 6)
+        about["speed_mm_s"] = [round(float(record.speed.min()), 6), round(float(record.speed.max()), 6)]
+    return about
+
+
+def _of_toml(path: Path) -> dict[str, Any]:
+    head(path)
+    if path.stat().st_size > _TOML_LIMIT:
+        raise InputError(
+            f"{path} has {path.stat().st_size:,} bytes; expected a scenario of {_TOML_LIMIT:,} at most"
+        )
+    try:
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} is no valid TOML: {' '.join(str(error).split())}") from error
+    return {
+        "format": "TOML scenario" if "needle" in document else "TOML, no scenario (it has no [needle])",
+        "tables": {name: sorted(v) if isinstance(v, dict) else v for name, v in document.items()},
+    }
+
+
+def _size(columns: int, rows: int, spacing: tuple[float, float]) -> list[float]:
+    """Width and depth in mm, whole pixels included."""
+    return [round(columns * spacing[0], 4), round(rows * spacing[1], 4)]
+
+
+def _lines(key: str, value: Any) -> list[str]:
+    """Return a value as a person reads it, a line for each thing."""
+    shown = _SHOWN.get(key)
+    return [_short(value)] if shown is None or value is None else shown(value) or ["none"]
+
+
+def _shown_pixels(value: dict[str, Any]) -> list[str]:
+    return [
+        f"{value['columns']} x {value['rows']}, {'RGB' if value['channels'] == 3 else 'grey'}, {value['type']}"
+    ]
+
+
+def _shown_box(value: list[int]) -> list[str]:
+    return [f"columns {value[0]} to {value[2] - 1}, rows {value[1]} to {value[3] - 1}"]
+
+
+def _shown_regions(value: list[dict[str, Any]]) -> list[str]:
+    return [
+        f"{r['content']}, {_shown_box(r['box'])[0]}"
+        + (f", {r['spacing_mm'][0]:.6g} x {r['spacing_mm'][1]:.6g} mm" if r["spacing_mm"] else "")
+        for r in value
+    ]
+
+
+_SHOWN: dict[str, Callable[[Any], list[str]]] = {
+    "pixels": _shown_pixels,
+    "bytes": lambda v: [f"{v:,}"],
+    "decoded_mib": lambda v: [f"{v:,.6g}"],
+    "spacing_mm": lambda v: [f"{v[0]:.6g} lateral, {v[1]:.6g} depth"],
+    "size_mm": lambda v: [f"{v[0]:.6g} wide, {v[1]:.6g} deep"],
+    "speed_mm_s": lambda v: [f"{v[0]:.6g} to {v[1]:.6g}"],
+    "region": _shown_box,
+    "regions": _shown_regions,
+    "arrays": lambda v: [f"{name} {tuple(shape)}" for name, shape in v.items()],
+    "tables": lambda v: [f"{name}: {_short(part)}" for name, part in v.items()],
+    "notes": lambda v: [str(note) for note in v],
+}
+_UNITS = ("mm_s", "mm", "mib", "s")
+
+
+def _label(key: str) -> str:
+    """Return "spacing_mm" as "spacing, mm"."""
+    unit = next((unit for unit in _UNITS if key.endswith(f"_{unit}")), None)
+    name = key.removesuffix(f"_{unit}").replace("_", " ")
+    return f"{name}, {unit.replace('mib', 'MiB').replace('mm_s', 'mm/s')}" if unit else name
+
+
+def _short(value: Any) -> str:
+    if value is None:
+        return "not in the file"
+    if isinstance(value, list):
+        return (
+            " x ".join(map(str, value))
+            if all(isinstance(v, int) for v in value)
+            else ", ".join(map(str, value))
+        )
+    return str(value)
