@@ -227,7 +227,9 @@ def _write_section(table: Any, section: BaseModel) -> None:
         value = getattr(section, name)
         if value is None:
             continue
-        if isinstance(value, BaseModel) or (isinstance(value, list) and value and isinstance(value[0], BaseModel)):
+        if isinstance(value, BaseModel) or (
+            isinstance(value, list) and value and isinstance(value[0], BaseModel)
+        ):
             inner.append((name, value))
         else:
             item = tomlkit.item(_as_toml(value))
