@@ -136,10 +136,13 @@ class FEMModel:
 
     def friction_loads(self, pose: NeedlePose) -> Floats:
         """Nodal loads (n, 2) in N of steady friction at this pose and speed."""
-        if pose.depth < ZERO_LENGTH or pose.speed == 0 or self.forces.friction == 0:
+        return self.shaft_loads(pose, self.forces.friction * pose.speed)
+
+    def shaft_loads(self, pose: NeedlePose, force_per_mm: float) -> Floats:
+        """Nodal loads (n, 2) in N of a force per length (N/mm) along the axis, on all of the shaft in the tissue."""
+        if pose.depth < ZERO_LENGTH or force_per_mm == 0:
             return np.zeros((self.grid.size, 2))
-        per_mm = self.forces.friction * pose.speed * np.array(pose.axis)
-        return line_loads(self.grid, pose.entry, pose.tip, per_mm)
+        return line_loads(self.grid, pose.entry, pose.tip, force_per_mm * np.array(pose.axis))
 
     def tip_loads(self, pose: NeedlePose, force: float) -> Floats:
         """Nodal loads (n, 2) in N of a force (N) at the tip along the axis; none where the tip is out of the tissue."""
