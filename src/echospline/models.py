@@ -1,4 +1,4 @@
-"""Where the words "tps", "elastic" and "fem" become classes: imported by the command line and the study alone."""
+"""Where the words "tps", "elastic", "green" and "fem" become classes: imported by the command line and the study alone."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from echospline.errors import InputError
 from echospline.grid import RegularGrid
 from echospline.mechanics.fem import FEMModel
 from echospline.mechanics.forces import NeedleForces
+from echospline.mechanics.green import GreenModel
 from echospline.mechanics.kernels import Elastic, ThinPlate
 from echospline.mechanics.model import TissueModel
 from echospline.mechanics.tps import TPSModel, TPSParameters
 from echospline.scenario import Scenario
 
-MODELS = ("tps", "elastic", "fem")
+MODELS = ("tps", "elastic", "green", "fem")
 
 
 def build_model(
@@ -28,7 +29,7 @@ def build_model(
         Its [tissue], [mesh] and [model].
     grid : RegularGrid
         The mesh.
-    kind : {"tps", "elastic", "fem"}, optional
+    kind : {"tps", "elastic", "green", "fem"}, optional
         Another model than the scenario's, for the same scene.
     folder : Path, optional
         Where relative paths of the scenario start; the working folder when not given.
@@ -41,12 +42,12 @@ def build_model(
     kind = kind or scenario.model.kind
     tissue = scenario.make_tissue(folder or Path(), grid)
     clamped, points = scenario.mesh.clamped, scenario.mesh.clamped_points
-    if kind == "fem":
-        if points:
-            raise InputError(
-                "mesh.clamped_points: fem clamps whole edges; leave the points out or choose tps"
-            )
-        return FEMModel(grid, clamped, tissue, NeedleForces(**scenario.model.forces.model_dump()))
+    if kind in ("fem", "green"):
+        forces = NeedleForces(**scenario.model.forces.model_dump())
+        if kind == "fem":
+            return FEMModel(grid, clamped, tissue, forces, clamped_points=points)
+        radius = scenario.model.green.radius
+        return GreenModel(grid, clamped, tissue, forces, clamped_points=points, radius=radius)
     parameters = TPSParameters(**scenario.model.landmarks.model_dump())
     if kind == "tps":
         return TPSModel(grid, clamped, parameters, ThinPlate(), clamped_points=points)

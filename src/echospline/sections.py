@@ -166,8 +166,14 @@ class ElasticSection(Section):
     )
 
 
+class GreenSection(Section):
+    """Green's function of tissue under a free surface."""
+
+    radius: Millimetres = Field(0.4, gt=0, le=50, description="length over which a force is spread, mm")
+
+
 class ForceSection(Section):
-    """The needle's forces for fem."""
+    """The needle's forces for fem and green."""
 
     tip: Newtons = Field(0.4, ge=0, le=100, description="cutting force at the tip, N")
     friction: Friction = Field(
@@ -182,9 +188,10 @@ class ForceSection(Section):
 class ModelSection(Section):
     """How the tissue answers."""
 
-    kind: Literal["tps", "elastic", "fem"] = Field("tps", description="tps, elastic or fem")
+    kind: Literal["tps", "elastic", "green", "fem"] = Field("tps", description="tps, elastic, green or fem")
     landmarks: LandmarkSection = LandmarkSection()
     elastic: ElasticSection = ElasticSection()
+    green: GreenSection = GreenSection()
     forces: ForceSection = ForceSection()
 
 

@@ -23,6 +23,7 @@ from echospline.mechanics.finite_elements import (
     stiffness,
 )
 from echospline.mechanics.forces import NeedleForces, check_step, travelled
+from echospline.mechanics.landmarks import Clamps
 from echospline.needle import ZERO_LENGTH, NeedlePose
 from echospline.tissue import Tissue
 
@@ -64,6 +65,8 @@ class FEMModel:
         What the needle exerts.
     solver : {"cholmod", "superlu"}
         See `finite_elements.factor`.
+    clamped_points : array_like, shape (k, 2), optional
+        Further points held fast, mm: the mesh nodes nearest to them.
     integration : {"full", "selective"}, optional
         See `finite_elements.stiffness`; by default selective where plane strain would lock, else full.
 
@@ -80,13 +83,14 @@ class FEMModel:
         tissue: Tissue | None = None,
         forces: NeedleForces | None = None,
         *,
+        clamped_points: ArrayLike | None = None,
         solver: Method = "cholmod",
         integration: Integration | None = None,
     ) -> None:
         self._grid = grid
         self.tissue = tissue or Tissue()
         self.forces = forces or NeedleForces()
-        self.clamped = grid.boundary(clamped)
+        self.clamped = Clamps.of(grid, clamped, clamped_points).nodes
         young, poisson = self.tissue.in_cells(grid)
         if integration is None:
             integration = "selective" if self.tissue.plane == "strain" else "full"

@@ -62,6 +62,8 @@ class GreenModel:
         Homogeneous; E, nu, thickness, plane stress or strain.
     forces : NeedleForces
         What the needle exerts.
+    clamped_points : array_like, shape (k, 2), optional
+        Further anchors, mm.
     radius : float
         Over which a force is spread, mm; by default about the radius of an 18 gauge needle. The field near the
         tip depends on it, the field elsewhere does not.
@@ -83,6 +85,7 @@ class GreenModel:
         tissue: Tissue | None = None,
         forces: NeedleForces | None = None,
         *,
+        clamped_points: ArrayLike | None = None,
         radius: float = 0.4,
         anchor_spacing: float = 1.5,
         station_spacing: float = 1.0,
@@ -99,7 +102,7 @@ class GreenModel:
         edges = tuple(clamped)
         self.station_spacing = station_spacing
         self.green = GreensFunction(
-            Clamps.of(grid, edges).anchors(anchor_spacing),
+            Clamps.of(grid, edges, clamped_points).anchors(anchor_spacing),
             self.tissue.young,
             self.tissue.poisson,
             self.tissue.thickness,
