@@ -85,12 +85,15 @@ def test_a_displacement_record_is_described(tmp_path: Path) -> None:
 
 
 def test_a_scenario_is_told_from_other_toml(tmp_path: Path) -> None:
-    (tmp_path / "a.toml").write_text('[needle]\ndepth = 20\n[image]\nfile = "a.png"\n')
+    (tmp_path / "a.toml").write_text('[needle]\ndepth = 20\n[image]\nfile = "sample:calf"\n')
     (tmp_path / "b.toml").write_text("[project]\nname = 'x'\n")
     (tmp_path / "c.toml").write_text("[needle\n")
-    assert describe(str(tmp_path / "a.toml"))["format"] == "TOML scenario"
-    assert describe(str(tmp_path / "a.toml"))["tables"] == {"needle": ["depth"], "image": ["file"]}
-    assert "no scenario" in describe(str(tmp_path / "b.toml"))["format"]
+    (tmp_path / "d.toml").write_text("[needle]\ndepth = -3\n")
+    found = describe(str(tmp_path / "a.toml"))
+    assert (found["format"], found["image"], found["notes"]) == ("TOML scenario", "sample:calf", [])
+    assert found["tables"] == {"needle": ["depth"], "image": ["file"]}
+    assert describe(str(tmp_path / "b.toml"))["format"] == "TOML, no scenario"
+    assert "depth" in describe(str(tmp_path / "d.toml"))["notes"][0]
     with pytest.raises(InputError, match="no valid TOML"):
         describe(str(tmp_path / "c.toml"))
 

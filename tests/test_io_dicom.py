@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from io import BytesIO
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pydicom
@@ -164,15 +165,26 @@ def test_every_transfer_syntax_that_needs_no_extra_is_read(name: str, shape: tup
     assert image.pixels.std() > 1
 
 
-@pytest.mark.parametrize("name", ["SC_rgb_jpeg_gdcm.dcm", "MR_small_jpeg_ls_lossless.dcm", "JPGExtended.dcm"])
+LOSSLESS = ["SC_rgb_jpeg_gdcm.dcm", "MR_small_jpeg_ls_lossless.dcm"]
+
+
+@pytest.mark.parametrize("name", LOSSLESS)
 def test_a_compression_that_needs_the_extra_says_which(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    try:
-        import gdcm  # noqa: F401, PLC0415
-    except ImportError:
-        with pytest.raises(MissingExtraError, match=r"pip install 'echospline\[dicom\]'"):
-            read(get_testdata_file(name), spacing=(0.1, 0.1))
-    else:
-        assert read(get_testdata_file(name), spacing=(0.1, 0.1)).pixels.std() > 1
+    monkeypatch.setattr("echospline.io.dicom.get_decoder", lambda syntax: SimpleNamespace(is_available=False))
+    with pytest.raises(MissingExtraError, match=r"pip install 'echospline\[dicom\]'"):
+        read(get_testdata_file(name), spacing=(0.1, 0.1))
+
+
+@pytest.mark.parametrize(("name", "same"), [*zip(LOSSLESS, ["SC_rgb_rle.dcm", "MR_small.dcm"], strict=True)])
+def test_lossless_jpeg_equals_the_picture_without_it(name: str, same: str) -> None:
+    pytest.importorskip("gdcm", reason="the extra dicom is not installed")
+    image = read(get_testdata_file(name), colour=True)
+    np.testing.assert_array_equal(image.pixels, pydicom.dcmread(get_testdata_file(same)).pixel_array)
+
+
+def test_twelve_bit_jpeg_has_no_decoder_and_is_not_called_damaged() -> None:
+    with pytest.raises(InputError, match="12 bits, for which there is no decoder"):
+        read(get_testdata_file("JPGExtended.dcm"))
 
 
 def test_lateral_and_depth_spacing_are_not_swapped(tmp_path: Path) -> None:

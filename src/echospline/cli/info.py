@@ -13,15 +13,13 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from echospline import scenario
 from echospline.data import SAMPLES, sample_image
 from echospline.errors import InputError
 from echospline.io.displacement import displacement_shapes, read_displacement
-from echospline.io.kind import head, kind_of
+from echospline.io.kind import kind_of
 from echospline.io.reading import SAMPLE, open_recording
 from echospline.io.recording import LIMIT, MIB, Recording
-
-_TOML_LIMIT = 2**20
-"""Bytes; a scenario is a page or two."""
 
 
 def info(
@@ -168,19 +166,34 @@ def _of_displacement(path: Path, limit: float) -> dict[str, Any]:
 
 
 def _of_toml(path: Path) -> dict[str, Any]:
-    head(path)
-    if path.stat().st_size > _TOML_LIMIT:
+    """Describe a scenario; of another TOML file its tables alone."""
+    if path.stat().st_size > scenario.LARGEST_FILE:
         raise InputError(
-            f"{path} has {path.stat().st_size:,} bytes; expected a scenario of {_TOML_LIMIT:,} at most"
+            f"{path} has {path.stat().st_size:,} bytes; a scenario has {scenario.LARGEST_FILE:,} at most"
         )
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path} is no valid TOML: {' '.join(str(error).split())}") from error
-    return {
-        "format": "TOML scenario" if "needle" in document else "TOML, no scenario (it has no [needle])",
-        "tables": {name: sorted(v) if isinstance(v, dict) else v for name, v in document.items()},
-    }
+    if not set(document) & set(scenario.Scenario.model_fields):
+        return {"format": "TOML, no scenario", "tables": _tables(document), "notes": []}
+    about: dict[str, Any] = {"format": "TOML scenario", "tables": _tables(document), "notes": []}
+    try:
+        run = scenario.load(path)
+    except InputError as error:
+        about["notes"].append(f"cannot be run: {error}")
+    else:
+        about |= {
+            "title": run.title,
+            "image": run.image.file,
+            "model": run.model.kind,
+            "mesh": list(run.mesh.nodes),
+        }
+    return about
+
+
+def _tables(document: dict[str, Any]) -> dict[str, Any]:
+    return {name: sorted(part) if isinstance(part, dict) else part for name, part in document.items()}
 
 
 def _size(columns: int, rows: int, spacing: tuple[float, float]) -> list[float]:

@@ -7,7 +7,6 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from importlib.util import find_spec
 from math import ceil, isfinite
 from pathlib import Path
 from typing import Any
@@ -153,16 +152,19 @@ def _check_deflated(path: Path, limit: float) -> None:
 
 def _check_decoder(path: Path, header: pydicom.Dataset) -> None:
     syntax = header.file_meta.TransferSyntaxUID
-    if syntax.is_compressed and syntax != DeflatedExplicitVRLittleEndian:
-        try:
-            decoder = get_decoder(syntax)
-        except NotImplementedError:
-            raise InputError(
-                f"{path} is compressed as {syntax.name}, for which there is no decoder"
-            ) from None
-        deep_jpeg = syntax == JPEGExtended12Bit and header.get("BitsStored") != 8
-        if not decoder.is_available or (deep_jpeg and find_spec("gdcm") is None):
-            raise MissingExtraError("python-gdcm", "dicom", f"DICOM compressed as {syntax.name}")
+    if not syntax.is_compressed or syntax == DeflatedExplicitVRLittleEndian:
+        return
+    try:
+        decoder = get_decoder(syntax)
+    except NotImplementedError:
+        decoder = None
+    if decoder is None or (syntax == JPEGExtended12Bit and header.get("BitsStored") != 8):
+        raise InputError(
+            f"{path} is compressed as {syntax.name} with {header.get('BitsStored')} bits, for which there is no "
+            "decoder: export it uncompressed"
+        )
+    if not decoder.is_available:
+        raise MissingExtraError("python-gdcm", "dicom", f"DICOM compressed as {syntax.name}")
 
 
 def _dtype(path: Path, header: pydicom.Dataset, colours: str) -> np.dtype[Any]:

@@ -111,10 +111,18 @@ def read(
     return Cine(frames, _times(recording, fps, len(frames)), grid, source)
 
 
-def read_image(path: str | Path, **options: object) -> UltrasoundImage:
-    """Read one image: as `read`, and of a cine its first frame unless ``frame`` says another."""
-    found = read(path, **{"frame": 0, **options})  # type: ignore[arg-type]
-    if isinstance(found, Cine):  # pragma: no cover - read returns an image whenever frame is given
+def read_image(
+    path: str | Path,
+    *,
+    spacing: Sequence[float] | None = None,
+    frame: int = 0,
+    region: Sequence[int] | None = None,
+    colour: bool = False,
+    limit: float = LIMIT,
+) -> UltrasoundImage:
+    """Read one image, of a cine the first unless ``frame`` says another; parameters as for `read`."""
+    found = read(path, spacing=spacing, frame=frame, region=region, colour=colour, limit=limit)
+    if isinstance(found, Cine):
         raise InputError(f"{path} holds a cine; expected an image: give a frame number")
     return found
 
