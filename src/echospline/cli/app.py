@@ -7,6 +7,7 @@ import sys
 import typer
 
 from echospline.cli.info import info
+from echospline.cli.simulate import demo, simulate
 from echospline.errors import EchosplineError
 
 app = typer.Typer(
@@ -19,11 +20,8 @@ app = typer.Typer(
 )
 
 
-@app.callback()
-def _main() -> None:
-    pass
-
-
+app.command()(simulate)
+app.command()(demo)
 app.command()(info)
 
 

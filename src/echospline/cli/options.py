@@ -1,0 +1,169 @@
+"""Command-line options that stand for keys of a scenario: flag, key, how the text is read.
+
+The help text, range and default of every option come from the scenario's own tables, so they are written once.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import typer
+
+from echospline.errors import InputError
+from echospline.scenario import Scenario, describe, load
+
+
+def _numbers(text: str) -> list[float]:
+    return [float(part) for part in text.split(",")]
+
+
+def _nodes(text: str) -> list[int]:
+    return [int(part) for part in text.lower().split("x")]
+
+
+def _integers(text: str) -> list[int]:
+    return [int(part) for part in text.split(",")]
+
+
+def _words(text: str) -> list[str]:
+    return [part.strip() for part in text.split(",") if part.strip()]
+
+
+def _border(text: str) -> float | str:
+    return text if text == "transparent" else float(text)
+
+
+@dataclass(frozen=True)
+class Option:
+    """One flag."""
+
+    flag: str
+    key: str
+    metavar: str
+    read: Callable[[str], Any] | None = None
+    panel: str = "Needle"
+
+
+def _landmark(name: str, metavar: str) -> Option:
+    return Option(
+        f"--{name.replace('_', '-')}", f"model.landmarks.{name}", metavar, None, "Model tps, elastic"
+    )
+
+
+OPTIONS = (
+    Option("--spacing", "image.spacing", "LAT,DEPTH", _numbers, "Image"),
+    Option("--frame", "image.frame", "N", int, "Image"),
+    Option("--region", "image.region", "L,T,R,B", _integers, "Image"),
+    Option("--mesh", "mesh.nodes", "NXxNY", _nodes, "Mesh"),
+    Option("--clamped", "mesh.clamped", "EDGE,...", _words, "Mesh"),
+    Option("--entry", "needle.entry", "X,Y", _numbers),
+    Option("--angle", "needle.angle", "DEG"),
+    Option("--depth", "needle.depth", "MM"),
+    Option("--speed", "needle.speed", "MM_S"),
+    Option("--dwell", "needle.dwell", "S"),
+    Option("--retract/--no-retract", "needle.retract", ""),
+    Option("--retract-speed", "needle.retract_speed", "MM_S"),
+    Option("--gauge", "needle.gauge", "N", int),
+    Option("--model", "model.kind", "NAME", None, "Model"),
+    _landmark("sigma", "MM"),
+    _landmark("delta", "MM"),
+    _landmark("alpha1", "S"),
+    _landmark("alpha2", "S"),
+    _landmark("alpha3", "1/S"),
+    _landmark("length", "MM"),
+    _landmark("drag", "0..1"),
+    _landmark("tip", "point|node"),
+    _landmark("loading", "LAW"),
+    _landmark("contact_spacing", "MM"),
+    _landmark("anchor_spacing", "MM"),
+    Option("--elastic-radius", "model.elastic.radius", "MM", None, "Model tps, elastic"),
+    Option("--tip-force", "model.forces.tip", "N", None, "Model fem"),
+    Option("--shaft-friction", "model.forces.friction", "NS/MM2", None, "Model fem"),
+    Option("--ramp", "model.forces.ramp", "MM", None, "Model fem"),
+    Option("--young", "tissue.young", "KPA", None, "Model fem"),
+    Option("--poisson", "tissue.poisson", "NU", None, "Model fem"),
+    Option("--thickness", "tissue.thickness", "MM", None, "Model fem"),
+    Option("--fps", "output.fps", "N", None, "Output"),
+    Option("--formats", "output.formats", "NAME,...", _words, "Output"),
+    Option("--border", "output.border", "VALUE", _border, "Output"),
+    Option("--folding", "output.folding", "flag|refuse", None, "Output"),
+    Option("--needle/--no-needle", "output.needle", "", None, "Output"),
+    Option("--figure/--no-figure", "output.figure", "", None, "Output"),
+    Option("--displacement/--no-displacement", "output.displacement", "", None, "Output"),
+)
+
+
+def with_scenario_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a Typer command every option of `OPTIONS`; it receives those given as ``changes={"needle.depth": "20"}``."""
+    hints = get_type_hints(command, include_extras=True)
+    own = [
+        p.replace(annotation=hints[p.name])
+        for p in inspect.signature(command).parameters.values()
+        if p.name != "changes"
+    ]
+    extra = [
+        inspect.Parameter(
+            _name(option),
+            inspect.Parameter.KEYWORD_ONLY,
+            annotation=bool | None if not option.metavar else str | None,
+            default=typer.Option(
+                None,
+                option.flag,
+                metavar=option.metavar or None,
+                help=describe(option.key),
+                rich_help_panel=option.panel,
+                show_default=False,
+            ),
+        )
+        for option in OPTIONS
+    ]
+
+    def wrapped(**given: Any) -> None:
+        changes = {o.key: v for o in OPTIONS if (v := given.pop(_name(o))) is not None}
+        command(**given, changes=changes)
+
+    named: Any = wrapped
+    named.__name__, named.__doc__ = command.__name__, command.__doc__
+    named.__signature__ = inspect.Signature([*own, *extra])
+    named.__annotations__ = {p.name: p.annotation for p in (*own, *extra)}
+    return wrapped
+
+
+def scenario_from(source: str, changes: dict[str, Any]) -> tuple[Scenario, Path]:
+    """Read a scenario, or start one on an image, and apply the options given.
+
+    Returns
+    -------
+    scenario : Scenario
+    folder : Path
+        Where its relative paths start.
+
+    Raises
+    ------
+    InputError
+        If the file or an option is not what it must be.
+    """
+    if source.lower().endswith(".toml"):
+        scenario, folder = load(source), Path(source).resolve().parent
+    else:
+        scenario, folder = Scenario(), Path.cwd()
+        changes = {"image.file": source, **changes}
+    return scenario.with_values({k: _read(k, v) for k, v in changes.items()}, "option"), folder
+
+
+def _name(option: Option) -> str:
+    return option.flag.split("/")[0].lstrip("-").replace("-", "_")
+
+
+def _read(key: str, value: Any) -> Any:
+    option = next((o for o in OPTIONS if o.key == key), None)
+    if option is None or option.read is None or not isinstance(value, str):
+        return value
+    try:
+        return option.read(value)
+    except ValueError:
+        raise InputError(f"{option.flag} expects {option.metavar} ({describe(key)}); got {value!r}") from None

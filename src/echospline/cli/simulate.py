@@ -1,0 +1,100 @@
+"""``echospline simulate`` and ``echospline demo``: from an image and a needle to a cine with its true motion."""
+
+from __future__ import annotations
+
+import json
+import sys
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from echospline.cli.options import scenario_from, with_scenario_options
+from echospline.models import build_model
+from echospline.run import run
+
+Out = Annotated[Path, typer.Option("--out", help="folder for the results, made where it is not there")]
+Json = Annotated[bool, typer.Option("--json", help="print the report of the run as JSON, nothing else")]
+
+
+@with_scenario_options
+def simulate(
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="IMAGE_OR_SCENARIO",
+            help="an image, cine or DICOM file, sample:calf, or a scenario (.toml)",
+        ),
+    ],
+    out: Out = Path("out"),
+    json_: Json = False,
+    changes: dict[str, Any] | None = None,
+) -> None:
+    """Push a needle into an ultrasound image and write how it deforms.
+
+    Writes the cine, `displacement.npz` (the true motion), `summary.png`, `scenario.toml` (the run, resolved: running it
+    again gives the same numbers) and `run.json` (parameters, versions, time per stage) into the folder. Options
+    replace what the scenario says.
+    """
+    simulate_into(source, out, changes or {}, as_json=json_)
+
+
+def demo(out: Out = Path("out/demo"), json_: Json = False) -> None:
+    """Run the main job on the image that ships inside: a needle into calf muscle, in and out again."""
+    with as_file(files("echospline.data").joinpath("demo.toml")) as scenario:
+        simulate_into(str(scenario), out, {}, as_json=json_)
+
+
+def simulate_into(source: str, out: Path, changes: dict[str, Any], *, as_json: bool) -> None:
+    """Run a scenario with a progress bar on a terminal, and say what came out."""
+    scenario, folder = scenario_from(source, changes)
+    image = scenario.read_image(folder)
+    model = build_model(scenario, scenario.grid(image), folder=folder)
+    console = Console(stderr=True)
+    with Progress(
+        TextColumn("simulating"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=console,
+        transient=True,
+        disable=as_json or not console.is_terminal,
+    ) as bar:
+        task = bar.add_task("simulating", total=None)
+        report = run(
+            scenario,
+            image,
+            model,
+            out,
+            folder,
+            progress=lambda done, count: bar.update(task, completed=done, total=count),
+        )
+    if as_json:
+        json.dump(report, sys.stdout, indent=2)
+        print()
+        return
+    _tell(report, out)
+
+
+def _tell(report: dict[str, Any], out: Path) -> None:
+    console = Console()
+    table = Table(title=f"{report['frames']} frames in {report['seconds']:.1f} s", title_justify="left")
+    table.add_column("stage")
+    table.add_column("median ms", justify="right")
+    table.add_column("p99 ms", justify="right")
+    for name, ms in report["milliseconds_per_frame"].items():
+        table.add_row(name, f"{ms['median']:.2f}", f"{ms['p99']:.2f}")
+    console.print(table)
+    console.print(
+        f"largest displacement {report['largest_displacement_mm']:.2f} mm, "
+        f"inverse map within {report['inverse_map_residual_px']:.1e} px"
+    )
+    for fold in report["folded_frames"][:1]:
+        console.print(
+            f"[yellow]{len(report['folded_frames'])} frames fold, first at {fold['time_s']} s: {fold['what']}[/]"
+        )
+    console.print(f"results in {out}: {', '.join(report['files'])}")
