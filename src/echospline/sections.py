@@ -140,8 +140,8 @@ class LandmarkSection(Section):
 
     sigma: Millimetres = Field(1.0, ge=0, le=50, description="push of the tip (12), mm")
     delta: Millimetres = Field(1.5, ge=0, le=50, description="reach of friction around the shaft (13), mm")
-    alpha1: Seconds = Field(0.04, ge=-10, le=10, description="friction (15), s")
-    alpha2: Seconds = Field(0.2, ge=-10, le=10, description="friction that falls with distance (15), s")
+    alpha1: Seconds = Field(0.08, ge=-10, le=10, description="friction (15), s")
+    alpha2: Seconds = Field(0.04, ge=-10, le=10, description="friction that falls with distance (15), s")
     alpha3: Rate = Field(1.0, ge=0, le=1e3, description="relaxation (16), 1/s")
     length: Millimetres = Field(1.0, gt=0, le=100, description="length inside the exponential of (15), mm")
     drag: float = Field(

@@ -62,8 +62,8 @@ class TPSParameters:
 
     sigma: float = 1.0
     delta: float = 1.5
-    alpha1: float = 0.04
-    alpha2: float = 0.2
+    alpha1: float = 0.08
+    alpha2: float = 0.04
     alpha3: float = 1.0
     length: float = 1.0
     drag: float = 1.0
