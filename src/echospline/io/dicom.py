@@ -87,14 +87,21 @@ def open_dicom(path: Path, limit: float) -> Recording:
         mislabelled = _mislabelled(path, header)
         if mislabelled:
             notes.append("labelled RGB but its JPEG frames hold YCbCr: converted")
-    deflated = header.file_meta.TransferSyntaxUID == DeflatedExplicitVRLittleEndian
-    table = header if colours.startswith("PALETTE") else None
+        syntax = header.file_meta.TransferSyntaxUID
+        stored = int(header.get("BitsStored") or dtype.itemsize * 8)
+        spacing = tissue.spacing if tissue else _pixel_spacing(header)
+
+    def shown(frame: int | None) -> Iterator[Pixels]:
+        for raw in _raw_frames(path, syntax == DeflatedExplicitVRLittleEndian, frame, mislabelled):
+            if colours.startswith("PALETTE"):
+                yield _coloured(raw, header)
+            else:
+                yield _upright(raw, stored) if colours == "MONOCHROME1" else raw
 
     def decode(frame: int | None, colour: bool) -> Iterator[Pixels]:
         count = 0
         with decoding(path, "DICOM"):
-            for raw in quietly(_raw_frames(path, deflated, frame, mislabelled), _quiet):
-                pixels = _upright(raw if table is None else _coloured(raw, table), colours, header)
+            for pixels in quietly(shown(frame), _quiet):
                 if pixels.shape[:2] != (rows, columns):
                     raise InputError(
                         f"{path} declares {columns} x {rows} pixels but a frame has {pixels.shape[1::-1]}"
@@ -105,8 +112,8 @@ def open_dicom(path: Path, limit: float) -> Recording:
                 raise InputError(f"{path} declares {frames} frames but holds {count}: it is cut short")
 
     return Recording(
-        path, f"DICOM, {header.file_meta.TransferSyntaxUID.name}", rows, columns, frames, channels, dtype, decode,
-        spacing=tissue.spacing if tissue else _pixel_spacing(header), region=tissue.box if tissue else None,
+        path, f"DICOM, {syntax.name}", rows, columns, frames, channels, dtype, decode,
+        spacing=spacing, region=tissue.box if tissue else None,
         regions=regions, times=times, single=frames == 1, notes=tuple(notes),
     )  # fmt: skip
 
@@ -177,11 +184,8 @@ def _dtype(path: Path, header: pydicom.Dataset, colours: str) -> np.dtype[Any]:
     return np.dtype(f"{'i' if signed else 'u'}{bits // 8}")
 
 
-def _upright(pixels: Pixels, colours: str, header: pydicom.Dataset) -> Pixels:
-    """MONOCHROME1 shows its lowest value white; everything else is as it is."""
-    if colours != "MONOCHROME1":
-        return pixels
-    stored = int(header.get("BitsStored", pixels.dtype.itemsize * 8))
+def _upright(pixels: Pixels, stored: int) -> Pixels:
+    """MONOCHROME1, whose lowest value is white, the other way round."""
     top = 2**stored - 1 if pixels.dtype.kind == "u" else -1
     inverted: Pixels = (top - pixels.astype(np.int64)).astype(pixels.dtype)
     return inverted
