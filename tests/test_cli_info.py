@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 
@@ -12,7 +11,7 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from echospline.cli.app import app
+from echospline.cli.app import app, main
 from echospline.cli.info import describe
 from echospline.errors import InputError
 from echospline.grid import RegularGrid
@@ -104,13 +103,18 @@ def test_names_with_markup_in_them_are_printed_as_they_are(tmp_path: Path) -> No
     assert "a[bold]b[red].png" in shown(str(path)).replace("\n", "")
 
 
-def test_bad_input_ends_with_one_sentence_and_code_2(tmp_path: Path) -> None:
+def test_bad_input_ends_with_one_sentence_and_code_2(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "a.png").write_bytes(b"%PDF-1.4")
-    for name in (str(tmp_path / "a.png"), str(tmp_path / "missing.dcm"), str(tmp_path), "sample:liver"):
-        run = subprocess.run(
-            [sys.executable, "-m", "echospline", "info", name], capture_output=True, text=True, check=False
-        )
-        assert run.returncode == 2
-        assert run.stdout == ""
-        assert run.stderr.startswith("echospline: ")
-        assert run.stderr.count("\n") == 1
+    (tmp_path / "b.nrrd").write_bytes(b"NRRD0004\ntype: uint8\n")
+    for name in ("a.png", "b.nrrd", "missing.dcm", ".", "sample:liver"):
+        path = name if name.startswith("sample") else str(tmp_path / name)
+        monkeypatch.setattr(sys, "argv", ["echospline", "info", path])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        out, err = capfd.readouterr()
+        assert ended.value.code == 2
+        assert out == ""
+        assert err.startswith("echospline: ")
+        assert err.count("\n") == 1

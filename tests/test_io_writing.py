@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 import SimpleITK
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from echospline.errors import InputError
 from echospline.grid import RegularGrid
-from echospline.io import DisplacementWriter, open_writer, read_displacement
+from echospline.io import DisplacementWriter, open_writer, read, read_displacement
 from echospline.needle import NeedlePose
 
 GRID = RegularGrid((33, 21), (0.1, 0.2), (1.5, -2.0))
@@ -285,3 +286,59 @@ def test_a_killed_run_leaves_the_old_file_and_a_readable_part(tmp_path: Path, na
     else:
         assert target.read_bytes() == b"from an earlier run"
     assert count_frames(tmp_path / f"{name}.part") >= 120
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "frames"])
+def test_what_is_written_here_knows_its_spacing(tmp_path: Path, name: str) -> None:
+    write(tmp_path / name, frames(), np.arange(6) / 25)
+    path = tmp_path / name if name == "a.mp4" else tmp_path / name / "frame_00002.png"
+    assert read(path, frame=0).grid.spacing == GRID.spacing
+    assert read(path, frame=0, spacing=(1.0, 2.0)).grid.spacing == (1.0, 2.0)
+
+
+@pytest.mark.parametrize(
+    "lengths", ["0 0", "-0.1 0.1", "nan 0.1", "1e999 0.1", "0.1.1 0.1", "0.1 0.1 and more"]
+)
+def test_a_comment_that_is_no_spacing_is_left_alone(tmp_path: Path, lengths: str) -> None:
+    first, second = lengths.split(" ", 1)
+    note = PngInfo()
+    note.add_text("Comment", f"echospline: pixels of {first} mm lateral, {second} mm depth")
+    Image.fromarray(frames()[0]).save(tmp_path / "a.png", pnginfo=note)
+    with pytest.raises(InputError, match="--spacing LAT,DEPTH"):
+        read(tmp_path / "a.png")
+
+
+BOUNDED = """
+import resource, sys, numpy as np
+from echospline.grid import RegularGrid
+from echospline.io import DisplacementWriter, open_writer
+from echospline.needle import NeedlePose
+name, count = sys.argv[1], int(sys.argv[2])
+grid = RegularGrid((300, 200), (0.1, 0.1))
+rng = np.random.default_rng(0)
+if name.endswith(".npz"):
+    field = rng.normal(size=(grid.size, 2))
+    with DisplacementWriter(name, grid.nodes) as writer:
+        for k in range(count):
+            writer.add(field, k / 30, NeedlePose((0, 0), (0, 1), 1))
+else:
+    pixels = rng.integers(0, 256, (200, 300), dtype=np.uint8)
+    with open_writer(name, grid, 30) as writer:
+        for k in range(count):
+            writer.add(np.roll(pixels, k), k / 30)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads the peak of memory as Linux counts it")
+@pytest.mark.parametrize(
+    ("name", "few", "many"), [("a.mp4", 60, 360), ("a.gif", 60, 360), ("a.mha", 60, 900), ("a.npz", 10, 110)]
+)
+def test_a_longer_cine_takes_no_more_memory(tmp_path: Path, name: str, few: int, many: int) -> None:
+    peaks = [
+        int(subprocess.run([sys.executable, "-c", BOUNDED, str(tmp_path / name), str(count)],
+                           capture_output=True, text=True, check=True).stdout)
+        for count in (few, many)
+    ]  # fmt: skip
+    held = 200 * 300 * (16 if name == "a.npz" else 1) * (many - few) / 1024  # KiB, were the frames kept
+    assert peaks[1] - peaks[0] < 0.3 * held

@@ -78,7 +78,7 @@ def summary_figure(
     _draw_image(rest, first, "At rest", shades)
     _draw_image(deformed, last, f"Needle {pose.depth:.1f} mm deep", shades)
     step = _draw_mesh(deformed, mesh, displacement)
-    _draw_needle(deformed, pose)
+    _draw_needle(deformed, pose, 1.2)
     _draw_displacement(figure, field, mesh, displacement, pose)
     every = f", every {step}th line drawn" if step > 1 else ""
     deformed.set_xlabel(f"lateral, mm\nmesh {mesh.shape[0]} x {mesh.shape[1]}{every}")
@@ -157,11 +157,11 @@ def _every(count: int, step: int) -> list[int]:
     return sorted({*range(0, count, step), count - 1})
 
 
-def _draw_needle(axes: Axes, pose: NeedlePose) -> None:
+def _draw_needle(axes: Axes, pose: NeedlePose, width: float = 2.0) -> None:
     """Shaft and tip, with a dark rim so that they show on bright tissue and on the map."""
-    rim = [Stroke(linewidth=3.6, foreground="black"), Normal()]
+    rim = [Stroke(linewidth=1.8 * width, foreground="black"), Normal()]
     (ex, ey), (tx, ty) = pose.entry, pose.tip
-    axes.plot([ex, tx], [ey, ty], color=NEEDLE, linewidth=2.0, solid_capstyle="round", path_effects=rim)
+    axes.plot([ex, tx], [ey, ty], color=NEEDLE, linewidth=width, solid_capstyle="round", path_effects=rim)
     axes.plot([tx], [ty], "o", color=NEEDLE, markersize=5, markeredgecolor="black", markeredgewidth=0.8)
 
 

@@ -9,9 +9,12 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from echospline.errors import InputError
+from echospline.grid import RegularGrid
 from echospline.image import Pixels
+from echospline.io.tag import spacing_tag
 
 _OURS = re.compile(r"frame_\d{5,}\.png|times\.csv|\.unfinished\.png")
 
@@ -23,6 +26,8 @@ class FramesEncoder:
     ----------
     part : Path
         Temporary folder; one left by an earlier run is emptied.
+    grid : RegularGrid
+        Pixel centres, mm; the spacing goes into each file's comment.
 
     Raises
     ------
@@ -30,7 +35,7 @@ class FramesEncoder:
         If the folder to be replaced holds anything but frames.
     """
 
-    def __init__(self, part: Path) -> None:
+    def __init__(self, part: Path, grid: RegularGrid) -> None:
         final = part.with_name(part.name.removesuffix(".part"))
         for folder in (part, final):
             check_ours(folder)
@@ -38,6 +43,8 @@ class FramesEncoder:
             shutil.rmtree(part)
         part.mkdir()
         self._part = part
+        self._note = PngInfo()
+        self._note.add_text("Comment", spacing_tag(grid))
         self._count = 0
         self._times = (part / "times.csv").open("w", encoding="ascii", newline="\n")
         self._times.write("frame,time_s\n")
@@ -45,7 +52,9 @@ class FramesEncoder:
     def add(self, pixels: Pixels, time: float) -> None:
         """Write one PNG, then its line in ``times.csv``."""
         unfinished = self._part / ".unfinished.png"
-        Image.fromarray(np.ascontiguousarray(pixels)).save(unfinished, format="PNG", compress_level=1)
+        Image.fromarray(np.ascontiguousarray(pixels)).save(
+            unfinished, format="PNG", compress_level=1, pnginfo=self._note
+        )
         os.replace(unfinished, self._part / f"frame_{self._count:05d}.png")
         self._times.write(f"{self._count},{time!r}\n")
         self._times.flush()

@@ -13,6 +13,7 @@ from av.video.reformatter import ColorRange, Colorspace
 from echospline.errors import InputError
 from echospline.grid import RegularGrid
 from echospline.image import Pixels
+from echospline.io.tag import spacing_tag
 
 CLOCK = 90_000
 """Ticks per second: the usual clock of video, finer than any frame rate."""
@@ -49,6 +50,7 @@ class Mp4Encoder:
             str(part), "w", format="mp4",
             options={"movflags": "frag_keyframe+empty_moov+default_base_moof", "flush_packets": "1"},
         )  # fmt: skip
+        self._container.metadata["comment"] = self._tag = spacing_tag(grid)
         rate = Fraction(fps).limit_denominator(1001)
         stream: Any = self._container.add_stream(
             "libx264", rate=rate, options={"crf": "12", "preset": "veryfast"}
@@ -87,6 +89,7 @@ class Mp4Encoder:
             av.open(str(self._part), format="mp4") as source,
             av.open(str(whole), "w", format="mp4", options={"movflags": "faststart"}) as target,
         ):
+            target.metadata["comment"] = self._tag
             stream = target.add_stream_from_template(source.streams.video[0])
             for packet in source.demux(video=0):
                 if packet.dts is not None:

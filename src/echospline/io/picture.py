@@ -13,6 +13,7 @@ from PIL import Image, ImageSequence
 from echospline.errors import InputError
 from echospline.image import Pixels
 from echospline.io.recording import Recording, check_size, decoding, quietly
+from echospline.io.tag import tagged_spacing
 
 _DEEP = {"I;16": np.uint16, "I;16L": np.uint16, "I;16B": np.uint16, "I": np.int32, "F": np.float32}
 """Grey of more than 8 bits keeps its values."""
@@ -52,6 +53,7 @@ def open_picture(path: Path, format: str, limit: float) -> Recording:
         check_size(path, image.height, image.width, frames, channels * dtype.itemsize, limit)
         delays = [_delay(page) for page in ImageSequence.Iterator(image)] if format in ("GIF", "PNG") else []
         rows, columns = image.height, image.width
+        spacing = tagged_spacing(image.info.get("Comment")) if format == "PNG" else None
 
     def decode(frame: int | None, colour: bool) -> Iterator[Pixels]:
         def pages() -> Iterator[Pixels]:
@@ -73,7 +75,7 @@ def open_picture(path: Path, format: str, limit: float) -> Recording:
         notes.append("transparency is left out")
     return Recording(
         path, format, rows, columns, frames, channels, dtype, decode,
-        times=times, single=frames == 1, notes=tuple(notes),
+        spacing=spacing, times=times, single=frames == 1, notes=tuple(notes),
     )  # fmt: skip
 
 

@@ -13,6 +13,7 @@ from echospline.errors import InputError
 from echospline.grid import Floats
 from echospline.image import Pixels
 from echospline.io.recording import Recording, check_size, decoding
+from echospline.io.tag import tagged_spacing
 
 _DEMUXERS = {"MP4": "mov", "QuickTime": "mov", "AVI": "avi", "Matroska": "matroska", "WebM": "matroska"}
 """The one demuxer tried for each format: others of FFmpeg's follow references to other files."""
@@ -50,6 +51,7 @@ def open_video(path: Path, format: str, limit: float) -> Recording:
         if packets < int(stream.frames) or packets == 0:
             raise InputError(f"{path} declares {stream.frames} frames but holds {packets}: it is cut short")
         check_size(path, rows, columns, packets, 1, limit)
+        spacing = tagged_spacing(container.metadata.get("comment"))
 
     def decode(frame: int | None, colour: bool) -> Iterator[Pixels]:
         count = 0
@@ -73,7 +75,7 @@ def open_video(path: Path, format: str, limit: float) -> Recording:
     notes = ["more than 8 bits per pixel, read as 8"] if deep else []
     return Recording(
         path, f"{format}, {name}", rows, columns, packets, 1 if grey else 3, np.dtype(np.uint8), decode,
-        times=times, notes=tuple(notes),
+        spacing=spacing, times=times, notes=tuple(notes),
     )  # fmt: skip
 
 

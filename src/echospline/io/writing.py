@@ -206,7 +206,7 @@ def open_writer(
         from echospline.io.frames import FramesEncoder  # noqa: PLC0415
 
         return CineWriter(
-            path, grid, lambda p, g, c, t: FramesEncoder(p), (byte, np.dtype(np.uint16)), window
+            path, grid, lambda p, g, c, t: FramesEncoder(p, g), (byte, np.dtype(np.uint16)), window
         )
     raise InputError(
         f"a cine is written as {', '.join(FORMATS)} or to a folder of PNG files (no suffix); got {path.name!r}"
