@@ -20,7 +20,6 @@ from echospline.image import UltrasoundImage
 from echospline.io import DisplacementWriter, open_writer
 from echospline.io.part import give_name, part_of
 from echospline.mechanics.model import State, TissueModel
-from echospline.plot import summary_figure
 from echospline.scenario import Scenario
 from echospline.simulate import Frame, ImageFormer, frame_count, simulate
 
@@ -131,6 +130,9 @@ def run(
             if progress is not None:
                 progress(frame.index + 1, count)
     if output.figure and first is not None and shown is not None:
+        # matplotlib takes longer to load than everything else together: only when a figure is drawn
+        from echospline.plot import summary_figure  # noqa: PLC0415
+
         title = scenario.title or f"{scenario.model.kind}: needle at {shown.time:.2f} s"
         summary_figure(
             first.image,

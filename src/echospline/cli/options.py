@@ -152,7 +152,14 @@ def scenario_from(source: str, changes: dict[str, Any]) -> tuple[Scenario, Path]
     else:
         scenario, folder = Scenario(), Path.cwd()
         changes = {"image.file": source, **changes}
-    return scenario.with_values({k: _read(k, v) for k, v in changes.items()}, "option"), folder
+    try:
+        return scenario.with_values({k: _read(k, v) for k, v in changes.items()}, "options"), folder
+    except InputError as error:  # the user wrote a flag, not a key
+        flag = next(
+            (o.flag for o in OPTIONS if str(error).startswith(f"options: {o.key}") and o.key in changes), None
+        )
+        key = next((o.key for o in OPTIONS if o.flag == flag), "")
+        raise InputError(str(error).replace(f"options: {key}", str(flag)) if flag else str(error)) from None
 
 
 def _name(option: Option) -> str:
