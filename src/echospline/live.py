@@ -325,8 +325,9 @@ class LiveEngine:
     def reset(self) -> None:
         """Take the needle home and the tissue to rest; also ends a replay and a failure."""
         with self._lock:
+            asked = self._requests
             self._requests = _Requests(
-                reset=True, frozen=False, model=self._requests.model, compare=self._requests.compare
+                reset=True, frozen=False, model=asked.model, compare=asked.compare, watch=asked.watch
             )
 
     def freeze(self, on: bool) -> None:

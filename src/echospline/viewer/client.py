@@ -1,0 +1,332 @@
+"""One page's connection: its engine, its frames (pulled, at most two in flight) and its exercise."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
+
+from echospline.errors import EchosplineError, InputError
+from echospline.live import LiveEngine, Numbered, Pacer, Snapshot
+from echospline.needle import NeedlePose
+from echospline.viewer import protocol
+from echospline.viewer.exercise import Exercise
+from echospline.viewer.guard import Allowance
+from echospline.viewer.scene import Scene, tip_of
+from echospline.viewer.scoring import Recorder, Score, Trace, score
+from echospline.viewer.sessions import Sessions
+
+log = logging.getLogger(__name__)
+
+IN_FLIGHT = 2
+"""Frames sent and not yet drawn; with two, one is on its way while the other is drawn."""
+PLOT_POINTS = 400
+"""Points of the summary's plot."""
+HISTORY = 50
+"""Earlier sessions of the same exercise in the summary."""
+
+
+@dataclass
+class Training:
+    """A running exercise, or the replay of one (of a stored session)."""
+
+    exercise: Exercise
+    recorder: Recorder
+    trainee: str = ""
+    session: int | None = None
+
+
+class Seat:
+    """An engine with what belongs to it; it outlives a reload of its page for a while."""
+
+    def __init__(self, scene: Scene, rate: float) -> None:
+        self.scene = scene
+        self.engine = LiveEngine(scene.models, scene.names[0][0], scene.home, rate=rate)
+        self.training: Training | None = None
+        self.model, self.compared = scene.names[0][0], ""
+
+    def end_training(self) -> None:
+        """Stop recording, and watching the targets."""
+        if self.training is not None:
+            self.engine.unobserve(self.training.recorder)
+            self.training = None
+            self.engine.watch(np.empty((0, 2)))
+
+
+class Client:
+    """Serves one web socket until it closes.
+
+    Parameters
+    ----------
+    socket : WebSocket
+        Accepted.
+    seat : Seat
+        The engine; this client runs it while it is connected.
+    sessions : Sessions
+        Where finished exercises go.
+    """
+
+    def __init__(self, socket: WebSocket, seat: Seat, sessions: Sessions) -> None:
+        self.socket, self.seat, self.sessions = socket, seat, sessions
+        self._sent = self._drawn = self._number = 0
+        self._credit, self._sending = asyncio.Event(), asyncio.Lock()
+        self._commands, self._requests = Allowance(400, 400), Allowance(20, 40)
+        self._failure: str | None = None
+        self._credit.set()
+
+    async def serve(self, resumed: bool) -> None:
+        """Serve until the page goes or breaks the protocol; the engine's thread ends with it."""
+        await self._tell("scene", **self._describe(resumed))
+        with Pacer(self.seat.engine):
+            tasks = [asyncio.create_task(self._receive()), asyncio.create_task(self._send_frames())]
+            try:
+                done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            finally:
+                for task in tasks:
+                    task.cancel()
+                results = await asyncio.gather(*tasks, return_exceptions=True)
+            for error in results:
+                await self._close(error)
+            del done
+
+    def _describe(self, resumed: bool) -> dict[str, Any]:
+        newest = self.seat.engine.snapshots.latest()
+        assert newest is not None  # the engine puts one when it is made
+        pose = newest.value.pose
+        training = self.seat.training
+        return {
+            "scene": self.seat.scene.describe(
+                _spline(self.seat.engine.model, newest.value.state) is not None
+            ),
+            "resumed": resumed,
+            "pose": {"entry": pose.entry, "tip": pose.tip},
+            "model": newest.value.model,
+            "frozen": newest.value.frozen,
+            "running": training.exercise.name if training and training.session is None else None,
+        }
+
+    # --- from the page
+
+    async def _receive(self) -> None:
+        while True:
+            message = await self.socket.receive()
+            if message["type"] == "websocket.disconnect":
+                return
+            if (data := message.get("bytes")) is not None:
+                if not self._commands.take():
+                    raise protocol.ProtocolError("too many messages: this page was closed for flooding")
+                self._take_command(protocol.decode_command(data))
+            else:
+                if not self._requests.take():
+                    raise protocol.ProtocolError("too many requests: this page was closed for flooding")
+                await self._answer(protocol.decode_request(message["text"]))
+
+    def _take_command(self, command: protocol.PoseCommand) -> None:
+        if command.drawn > self._sent or command.drawn < self._drawn:
+            raise protocol.ProtocolError(
+                f"frames {self._drawn} to {self._sent} can have been drawn now; got {command.drawn}"
+            )
+        if command.number <= self._number:
+            raise protocol.ProtocolError(f"command numbers ascend; got {command.number} after {self._number}")
+        self._drawn, self._number = command.drawn, command.number
+        if self._sent - self._drawn < IN_FLIGHT:
+            self._credit.set()
+        if command.pose is not None:
+            x, y, angle, depth = command.pose
+            self.seat.engine.command((x, y), tip_of((x, y), angle, depth), command.number, command.sent)
+
+    async def _answer(self, request: protocol.Request) -> None:
+        engine, names = self.seat.engine, [name for name, _ in self.seat.scene.names]
+        match request:
+            case protocol.Reset():
+                if self.seat.training and self.seat.training.session is not None:
+                    self.seat.end_training()
+                engine.reset()
+            case protocol.Freeze(on=on):
+                engine.freeze(on)
+            case protocol.SwitchModel(name=name) if name in names:
+                engine.switch(name)
+            case protocol.Compare(name=name) if name is None or name in names:
+                engine.compare(name)
+            case protocol.SwitchModel(name=name) | protocol.Compare(name=name):
+                await self._tell("notice", text=f"there is no model {name!r} here; it has {', '.join(names)}")
+            case protocol.StartExercise():
+                await self._start(request)
+            case protocol.FinishExercise(keep=keep):
+                await self._finish(keep)
+            case protocol.Replay(session=number):
+                await self._replay(number)
+
+    # --- training
+
+    async def _start(self, request: protocol.StartExercise) -> None:
+        exercise = self.seat.scene.exercise(request.exercise)
+        if exercise is None:
+            await self._tell("notice", text=f"there is no exercise {request.exercise!r} here")
+            return
+        self._begin(
+            Training(exercise, Recorder(self.seat.engine.period, exercise.time_limit), request.trainee)
+        )
+        self.seat.engine.reset()
+        await self._tell("running", exercise=exercise.name, replay=False)
+
+    def _begin(self, training: Training) -> None:
+        self.seat.end_training()
+        self.seat.training = training
+        self.seat.engine.watch(training.exercise.landmarks)
+        self.seat.engine.observe(training.recorder)
+
+    async def _finish(self, keep: bool) -> None:
+        training, newest = self.seat.training, self.seat.engine.snapshots.latest()
+        if training is None or newest is None:
+            await self._tell("notice", text="no exercise is running")
+            return
+        trace, model = training.recorder.trace(), newest.value.model
+        self.seat.end_training()
+        if not keep:
+            await self._tell("stopped")
+            return
+        summary = await asyncio.to_thread(self._summary, training, trace, model)
+        await self._tell("summary", **summary)
+
+    def _summary(self, training: Training, trace: Trace, model: str) -> dict[str, Any]:
+        result = score(trace, training.exercise)
+        number, again = training.session, training.session is not None
+        if number is None:
+            number = self.sessions.add(
+                training.exercise,
+                trace,
+                result,
+                trainee=training.trainee,
+                scene=self.seat.scene.title,
+                model=model,
+            )
+        history = [
+            {"id": s.id, "started": s.started, "score": s.score}
+            for s in self.sessions.newest()
+            if s.exercise == training.exercise.name and s.trainee == training.trainee
+        ]
+        return summary_of(number, training.exercise, trace, result) | {
+            "replayed": again, "model": model, "trainee": training.trainee, "history": history[:HISTORY],
+        }  # fmt: skip
+
+    async def _replay(self, number: int) -> None:
+        try:
+            session, exercise, trace = await asyncio.to_thread(self.sessions.load, number)
+            poses = resampled(trace, self.seat.engine.period)
+            if not self.seat.scene.grid.contains(exercise.landmarks).all():
+                raise InputError(
+                    "this session was recorded in another image: its targets lie outside this one"
+                )
+        except EchosplineError as error:
+            await self._tell("notice", text=str(error))
+            return
+        recorder = Recorder(self.seat.engine.period, self.seat.engine.period * len(poses))
+        self._begin(Training(exercise, recorder, session.trainee, number))
+        if session.model in [name for name, _ in self.seat.scene.names]:
+            self.seat.engine.switch(session.model)
+        self.seat.engine.replay(poses)
+        await self._tell("running", exercise=exercise.model_dump(), replay=True, model=session.model)
+
+    # --- to the page
+
+    async def _send_frames(self) -> None:
+        number = 0
+        while True:
+            await self._credit.wait()
+            newest = await self._newer_than(number)
+            number, snapshot = newest
+            if snapshot.failure != self._failure:
+                self._failure = snapshot.failure
+                if snapshot.failure is not None:
+                    await self._tell("failure", text=snapshot.failure)
+            self._sent += 1
+            if self._sent - self._drawn >= IN_FLIGHT:
+                self._credit.clear()
+            training = self.seat.training
+            data = protocol.encode_frame(
+                snapshot,
+                self._sent,
+                spline=_spline(self.seat.engine.model, snapshot.state),
+                recording=training is not None and training.session is None,
+            )
+            async with self._sending:
+                await self.socket.send_bytes(data)
+            if training is not None and training.recorder.over:
+                await self._finish(keep=True)
+
+    async def _newer_than(self, number: int) -> Numbered[Snapshot]:
+        """Wait, without a thread, for a snapshot that this client has not seen."""
+        slot, loop, here = self.seat.engine.snapshots, asyncio.get_running_loop(), asyncio.Event()
+
+        def wake() -> None:
+            if not loop.is_closed():
+                loop.call_soon_threadsafe(here.set)
+
+        slot.call_when_newer(number, wake)
+        await here.wait()
+        newest = slot.latest()
+        assert newest is not None  # it has just been announced
+        return newest
+
+    async def _tell(self, what: str, **content: object) -> None:
+        async with self._sending:
+            await self.socket.send_text(json.dumps({"tell": what, **content}, allow_nan=False))
+
+    async def _close(self, error: object) -> None:
+        """Close with the reason, if the page is still there."""
+        if error is None or isinstance(error, asyncio.CancelledError | WebSocketDisconnect):
+            return
+        if isinstance(error, protocol.ProtocolError):
+            log.warning("client closed: %s", error)
+            code, reason = 1008, str(error)
+        else:
+            assert isinstance(error, BaseException)  # a task ends with None or an exception
+            log.error("client closed by a fault", exc_info=error)
+            code, reason = 1011, "the server has a fault; its log says more"
+        if self.socket.application_state is WebSocketState.CONNECTED:
+            await self.socket.close(code, reason.encode()[:120].decode("utf-8", "ignore"))
+
+
+def _spline(model: object, state: object) -> protocol.SplineLike | None:
+    """Return the field as a spline where the model offers it."""
+    offered = getattr(model, "spline", None)
+    return None if offered is None or state is None else offered(state)
+
+
+def resampled(trace: Trace, period: float) -> list[NeedlePose]:
+    """Poses of a trace at an engine's period; unchanged when it is the trace's own."""
+    if len(trace) == 0:
+        raise InputError("this session holds no motion")
+    if abs(trace.period - period) < 1e-12:
+        return [trace.pose(row) for row in range(len(trace))]
+    times = np.arange(1, int(trace.times[-1] / period) + 1) * period
+    columns = np.stack([np.interp(times, trace.times, column) for column in trace.poses.T], axis=1)
+    return [
+        trace.__class__(period, columns, np.empty((len(columns), 0, 2))).pose(k) for k in range(len(columns))
+    ]
+
+
+def summary_of(number: int, exercise: Exercise, trace: Trace, result: Score) -> dict[str, Any]:
+    """What the page shows at the end, the plots thinned out."""
+    if len(trace) == 0:
+        rows, distance = np.empty(0, dtype=int), np.empty(0)
+    else:
+        rows = np.unique(np.linspace(0, len(trace) - 1, PLOT_POINTS).astype(int))
+        distance = np.hypot(*(trace.tip - trace.watched[:, 0]).T)
+    return {
+        "session": number,
+        "exercise": exercise.model_dump(),
+        "score": result.to_dict(),
+        "plot": {
+            "time": [round(float(trace.times[row]), 4) for row in rows],
+            "depth": [round(float(trace.depth[row]), 4) for row in rows],
+            "distance": [round(float(distance[row]), 4) for row in rows],
+            "tip": [[round(float(v), 4) for v in trace.tip[row]] for row in rows],
+        },
+    }

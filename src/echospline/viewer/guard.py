@@ -1,0 +1,138 @@
+"""Who may talk to the server: Host, Origin and token are checked before anything else; floods are counted."""
+
+from __future__ import annotations
+
+import hmac
+import time
+from collections.abc import Callable
+from urllib.parse import urlsplit
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import PlainTextResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+SUBPROTOCOL = "echospline.1"
+"""Offered by the page; a token travels beside it as ``token.<token>``, for a page cannot set headers there."""
+
+SECURITY_HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
+        "manifest-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-cache",
+}
+PUBLIC = ("/static/", "/favicon.ico")
+"""Paths that hold nothing secret: the page itself must load before it can present its token."""
+
+
+class Guard:
+    """Refuses requests by foreign names, pages and token-less clients, and adds the security headers.
+
+    A page of another site may make a browser connect here, and may give its own name this machine's address;
+    the checks of Origin and Host are what stops that.
+
+    Parameters
+    ----------
+    app : ASGI application
+        What is guarded.
+    hosts : frozenset of str, or None
+        Host names that are accepted (without port); None accepts any and relies on the token.
+    token : str or None
+        What a client must present, if anything.
+    """
+
+    def __init__(self, app: ASGIApp, hosts: frozenset[str] | None, token: str | None) -> None:
+        self.app, self.hosts, self.token = app, hosts, token
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve or refuse one connection."""
+        if scope["type"] not in ("http", "websocket"):
+            await self.app(scope, receive, send)
+            return
+        refusal = self.refusal(scope)
+        if refusal is not None:
+            if scope["type"] == "websocket":
+                await send({"type": "websocket.close", "code": 1008, "reason": refusal[1]})
+            else:
+                await PlainTextResponse(refusal[1], refusal[0])(scope, receive, send)
+            return
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in SECURITY_HEADERS.items():
+                    headers[name] = value
+            await send(message)
+
+        await self.app(scope, receive, send_with_headers)
+
+    def refusal(self, scope: Scope) -> tuple[int, str] | None:
+        """Status and reason if this connection is refused."""
+        headers = Headers(scope=scope)
+        hosts, origins = headers.getlist("host"), headers.getlist("origin")
+        if len(hosts) != 1:
+            return 400, "exactly one Host header is needed"
+        name = _host_name(hosts[0])
+        if name is None or (self.hosts is not None and name not in self.hosts):
+            return 421, "this server does not answer to that Host name"
+        if len(origins) > 1 or (origins and urlsplit(origins[0]).netloc.lower() != hosts[0].lower()):
+            return 403, "pages of another origin may not connect"
+        secret = scope["type"] == "websocket" or not (
+            scope["path"] == "/" or any(scope["path"].startswith(path) for path in PUBLIC)
+        )
+        if self.token is not None and secret and not self._token_matches(headers):
+            return 401, "the token is missing or wrong: open the address that the server printed"
+        return None
+
+    def _token_matches(self, headers: Headers) -> bool:
+        assert self.token is not None  # the caller asked
+        offered = [part.strip() for part in headers.get("sec-websocket-protocol", "").split(",")]
+        given = [part.removeprefix("token.") for part in offered if part.startswith("token.")]
+        scheme, _, bearer = headers.get("authorization", "").partition(" ")
+        if scheme.lower() == "bearer":
+            given.append(bearer)
+        return any(hmac.compare_digest(self.token.encode(), value.encode()) for value in given)
+
+
+def _host_name(host: str) -> str | None:
+    """Name in a Host header without the port, lower case; None if it is malformed."""
+    try:
+        parts = urlsplit(f"//{host}")
+        _ = parts.port
+    except ValueError:
+        return None
+    if parts.username is not None or parts.path or parts.query or parts.fragment:
+        return None
+    return parts.hostname
+
+
+class Allowance:
+    """A budget of messages that refills with time; empty means flooding.
+
+    Parameters
+    ----------
+    rate : float
+        Messages per second that may go on for ever.
+    burst : float
+        Messages that may come at once.
+    clock : callable
+        s.
+    """
+
+    def __init__(self, rate: float, burst: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self.rate, self.burst, self._clock = rate, burst, clock
+        self._left, self._last = burst, clock()
+
+    def take(self) -> bool:
+        """Count one message; False if it is one too many."""
+        now = self._clock()
+        self._left = min(self.burst, self._left + self.rate * (now - self._last))
+        self._last = now
+        if self._left < 1.0:
+            return False
+        self._left -= 1.0
+        return True

@@ -1,0 +1,307 @@
+"""The wire between page and server, version 1: little-endian binary for what flows, small JSON for what is asked.
+
+Page to server, every time a frame was drawn or the needle moved: a *command* of 36 bytes. Server to page,
+only when an earlier frame was drawn: a *frame*, which is a header of 68 bytes, the positions of the watched
+points, and the field: either the displacement of every mesh node (any model), or the landmarks and
+weights of a spline, which the page evaluates where it draws (1.7 kB for 105 landmarks, whatever the mesh).
+Everything a person asks for in words (reset, model, exercise) is a JSON *request* of at most 4096 bytes.
+
+`static/protocol.js` is the same in JavaScript; both are held to the same golden bytes.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from math import isfinite
+from typing import Annotated, Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from echospline.errors import InputError
+from echospline.live import Snapshot
+
+VERSION = 1
+COMMAND, FRAME = 1, 2
+
+FROZEN, REPLAYING, FAILED, HAS_REFERENCE, SPLINE, RECORDING = 1, 2, 4, 8, 16, 32
+"""Flags of a frame."""
+HAS_POSE = 1
+"""Flag of a command: it moves the needle, and does not only report what was drawn."""
+
+_COMMAND = struct.Struct("<BBHIIdffff")
+_FRAME = struct.Struct("<BBHIIIddffffffffHH")
+COMMAND_BYTES, FRAME_HEADER_BYTES = _COMMAND.size, _FRAME.size
+REQUEST_BYTES = 4096
+"""Longest JSON request."""
+
+MAX_LENGTH = 1000.0
+"""mm; no coordinate or depth of a command lies beyond it."""
+
+
+class ProtocolError(InputError):
+    """A message that breaks the protocol; its client is closed with the reason."""
+
+
+@dataclass(frozen=True, slots=True)
+class PoseCommand:
+    """What the page reports after drawing or moving.
+
+    Parameters
+    ----------
+    drawn : int
+        Number of the newest frame that was drawn, 0 before the first.
+    number : int
+        Of this command, ascending.
+    sent : float
+        The page's clock, ms; comes back in the frame that shows the command.
+    pose : (entry x, entry y, angle, depth) or None
+        mm, mm, degrees from +x towards depth, mm; None for a report only.
+    """
+
+    drawn: int
+    number: int
+    sent: float
+    pose: tuple[float, float, float, float] | None
+
+
+def encode_command(command: PoseCommand) -> bytes:
+    """Command as bytes (the page's side; used by tests and the load benchmark)."""
+    flags, pose = (0, (0.0, 0.0, 0.0, 0.0)) if command.pose is None else (HAS_POSE, command.pose)
+    return _COMMAND.pack(VERSION, COMMAND, flags, command.drawn, command.number, command.sent, *pose)
+
+
+def decode_command(data: bytes) -> PoseCommand:
+    """Read a command.
+
+    Raises
+    ------
+    ProtocolError
+        If length, version, kind, flags or a number is not as it must be.
+    """
+    if len(data) != COMMAND_BYTES:
+        raise ProtocolError(f"a command has {COMMAND_BYTES} bytes; got {len(data)}")
+    version, kind, flags, drawn, number, sent, *pose = _COMMAND.unpack(data)
+    if version != VERSION:
+        raise ProtocolError(f"this server speaks protocol version {VERSION}; got {version}: reload the page")
+    if kind != COMMAND or flags & ~HAS_POSE:
+        raise ProtocolError(f"a command has kind {COMMAND} and flags 0 or 1; got {kind} and {flags}")
+    if not isfinite(sent) or not all(isfinite(v) and abs(v) <= MAX_LENGTH for v in pose):
+        raise ProtocolError(f"a pose must be finite and within {MAX_LENGTH:g} mm; got {tuple(pose)}")
+    if pose[3] < 0:
+        raise ProtocolError(f"a depth must be zero or more; got {pose[3]:g} mm")
+    x, y, angle, depth = pose
+    return PoseCommand(drawn, number, sent, (x, y, angle, depth) if flags else None)
+
+
+class SplineLike(Protocol):
+    """What the wire takes from a fitted spline, in conditioned coordinates (x - centre) / scale."""
+
+    kernel: Any
+    landmarks: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    motion: NDArray[np.float64]
+    centre: NDArray[np.float64]
+    scale: float
+
+
+def encode_frame(
+    snapshot: Snapshot, number: int, *, spline: SplineLike | None = None, recording: bool = False
+) -> bytes:
+    """Frame as bytes.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+        What to show.
+    number : int
+        Of the frame, ascending from 1 for each client.
+    spline : optional
+        The snapshot's field as a spline; sent instead of the nodes when given and nothing is compared.
+    recording : bool
+        Whether an exercise is being recorded.
+    """
+    reference = snapshot.reference
+    largest = _largest(snapshot.displacement)
+    difference = 0.0 if reference is None else _largest(snapshot.displacement - reference)
+    flags = (
+        FROZEN * snapshot.frozen
+        | REPLAYING * snapshot.replaying
+        | FAILED * (snapshot.failure is not None)
+        | HAS_REFERENCE * (reference is not None)
+        | SPLINE * (spline is not None and reference is None)
+        | RECORDING * recording
+    )
+    if flags & SPLINE:
+        assert spline is not None  # by the line above
+        count, field = len(spline.landmarks), _spline_bytes(spline)
+    else:
+        count, field = len(snapshot.displacement), snapshot.displacement.astype("<f4").tobytes()
+        if reference is not None:
+            field += reference.astype("<f4").tobytes()
+    pose, command = snapshot.pose, snapshot.command
+    header = _FRAME.pack(
+        VERSION, FRAME, flags, number, command.number, count, command.sent, snapshot.time,
+        *pose.entry, *pose.tip, pose.speed, 1e3 * snapshot.duration, largest, difference,
+        len(snapshot.watched), 0,
+    )  # fmt: skip
+    return header + snapshot.watched.astype("<f4").tobytes() + field
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """A frame as the page reads it (for tests and the load benchmark); fields as in `encode_frame`."""
+
+    number: int
+    flags: int
+    command: int
+    sent: float
+    time: float
+    entry: tuple[float, float]
+    tip: tuple[float, float]
+    speed: float
+    duration: float
+    largest: float
+    difference: float
+    watched: NDArray[np.float32]
+    displacement: NDArray[np.float32] | None
+    reference: NDArray[np.float32] | None
+    spline: NDArray[np.float32] | None
+
+
+def decode_frame(data: bytes) -> Frame:
+    """Read a frame.
+
+    Raises
+    ------
+    ProtocolError
+        If it is not a whole frame of this version.
+    """
+    if len(data) < FRAME_HEADER_BYTES or data[0] != VERSION or data[1] != FRAME:
+        raise ProtocolError(
+            f"a frame begins with {VERSION}, {FRAME} and has {FRAME_HEADER_BYTES} bytes or more"
+        )
+    _, _, flags, number, command, count, sent, time, *floats, k, _ = _FRAME.unpack_from(data)
+    ex, ey, tx, ty, speed, duration, largest, difference = floats
+    per_item = 4 if flags & SPLINE else 4 if flags & HAS_REFERENCE else 2
+    head = SPLINE_HEAD if flags & SPLINE else 0
+    expected = FRAME_HEADER_BYTES + 4 * (2 * k + head + per_item * count)
+    if len(data) != expected:
+        raise ProtocolError(f"this frame must have {expected} bytes; got {len(data)}")
+    values = np.frombuffer(data, "<f4", offset=FRAME_HEADER_BYTES)
+    watched, field = values[: 2 * k].reshape(k, 2), values[2 * k :]
+    nodes = None if flags & SPLINE else field[: 2 * count].reshape(count, 2)
+    reference = field[2 * count :].reshape(count, 2) if flags & HAS_REFERENCE else None
+    return Frame(
+        number, flags, command, sent, time, (ex, ey), (tx, ty), speed, duration / 1e3, largest, difference,
+        watched, nodes, reference, field if flags & SPLINE else None,
+    )  # fmt: skip
+
+
+SPLINE_HEAD = 12
+"""float32 values before the landmarks: components, coupling, radius, centre x y, scale, motion 6."""
+
+
+def _spline_bytes(spline: SplineLike) -> bytes:
+    """Head, then (x, y, weight x, weight y) per landmark, all in conditioned coordinates."""
+    m, c = len(spline.landmarks), spline.kernel.components
+    kernel = spline.kernel
+    head = np.zeros(SPLINE_HEAD)
+    head[:6] = (
+        c,
+        getattr(kernel, "coupling", 0.0),
+        getattr(kernel, "radius", 0.0),
+        *spline.centre,
+        spline.scale,
+    )
+    head[6 : 6 + spline.motion.size] = spline.motion.ravel()
+    rows = np.empty((m, 4))
+    rows[:, :2] = (spline.landmarks - spline.centre) / spline.scale
+    rows[:, 2:] = spline.weights if c == 1 else spline.weights.reshape(2, m).T
+    return np.concatenate([head, rows.ravel()]).astype("<f4").tobytes()
+
+
+def _largest(displacement: NDArray[np.float64]) -> float:
+    if len(displacement) == 0:
+        return 0.0
+    return float(np.sqrt((displacement * displacement).sum(axis=1).max()))
+
+
+class _Request(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+
+class Reset(_Request):
+    """Needle out, tissue at rest."""
+
+    do: Literal["reset"]
+
+
+class Freeze(_Request):
+    """Let time stand still, or run."""
+
+    do: Literal["freeze"]
+    on: bool
+
+
+class SwitchModel(_Request):
+    """Another model in the same pose."""
+
+    do: Literal["model"]
+    name: str = Field(max_length=40)
+
+
+class Compare(_Request):
+    """Step a second model beside the first; null ends it."""
+
+    do: Literal["compare"]
+    name: str | None = Field(max_length=40)
+
+
+class StartExercise(_Request):
+    """Reset, place the targets, record."""
+
+    do: Literal["start"]
+    exercise: str = Field(max_length=80)
+    trainee: str = Field(default="", max_length=80)
+
+
+class FinishExercise(_Request):
+    """End the recording; ``keep`` scores and stores it."""
+
+    do: Literal["finish"]
+    keep: bool = True
+
+
+class Replay(_Request):
+    """Show a stored session again."""
+
+    do: Literal["replay"]
+    session: int = Field(ge=1, le=2**53)
+
+
+Request = Annotated[
+    Reset | Freeze | SwitchModel | Compare | StartExercise | FinishExercise | Replay,
+    Field(discriminator="do"),
+]
+_REQUESTS: TypeAdapter[Request] = TypeAdapter(Request)
+
+
+def decode_request(text: str) -> Request:
+    """Read a JSON request.
+
+    Raises
+    ------
+    ProtocolError
+        If it is too long, no JSON or none of the requests.
+    """
+    if len(text.encode("utf-8", "surrogatepass")) > REQUEST_BYTES:
+        raise ProtocolError(f"a request has at most {REQUEST_BYTES} bytes; got {len(text)}")
+    try:
+        return _REQUESTS.validate_json(text)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "request"
+        raise ProtocolError(f"not a request: {where}: {first['msg']}") from error

@@ -1,0 +1,182 @@
+"""Training sessions in SQLite: each written in one transaction, listed with progress, exported as CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import sqlite3
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from echospline.errors import InputError
+from echospline.viewer.exercise import Exercise
+from echospline.viewer.scoring import Score, Trace
+
+SCHEMA_VERSION = 1
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS session (
+  id INTEGER PRIMARY KEY,
+  started TEXT NOT NULL,      -- UTC, ISO 8601
+  trainee TEXT NOT NULL,
+  exercise TEXT NOT NULL,     -- name
+  definition TEXT NOT NULL,   -- the exercise as JSON: it can be scored again when the scenario is gone
+  scene TEXT NOT NULL,
+  model TEXT NOT NULL,
+  score TEXT NOT NULL,        -- JSON
+  trace BLOB NOT NULL
+)
+"""
+_COLUMNS = "id, started, trainee, exercise, scene, model, score"
+
+
+@dataclass(frozen=True)
+class Session:
+    """One row of the list; `score` has the fields of `Score`."""
+
+    id: int
+    started: str
+    trainee: str
+    exercise: str
+    scene: str
+    model: str
+    score: dict[str, Any]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+
+class Sessions:
+    """A file of sessions; every call opens it anew, so any thread may call and a kill leaves it whole.
+
+    Parameters
+    ----------
+    path : Path
+        Made with its folder when it does not exist.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be opened or is something else.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with self._open() as database:
+                (version,) = database.execute("PRAGMA user_version").fetchone()
+                if version not in (0, SCHEMA_VERSION):
+                    raise InputError(
+                        f"{path} was written by another version (schema {version}, this one knows {SCHEMA_VERSION}); "
+                        "choose another file with --sessions"
+                    )
+                database.execute("PRAGMA journal_mode = WAL")
+                database.execute(_SCHEMA)
+                database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+        except (OSError, sqlite3.Error) as error:
+            raise InputError(
+                f"cannot keep sessions in {path}: {error}; choose another file with --sessions"
+            ) from error
+
+    def add(
+        self, exercise: Exercise, trace: Trace, score: Score, *, trainee: str, scene: str, model: str
+    ) -> int:
+        """Store a session in one transaction; returns its id."""
+        row = (
+            datetime.now(UTC).isoformat(timespec="seconds"), trainee, exercise.name,
+            exercise.model_dump_json(), scene, model, json.dumps(score.to_dict()), trace.to_bytes(),
+        )  # fmt: skip
+        with self._open() as database:
+            cursor = database.execute(
+                "INSERT INTO session (started, trainee, exercise, definition, scene, model, score, trace) "
+                "VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+                row,
+            )
+            assert cursor.lastrowid is not None  # an INSERT has one
+            return cursor.lastrowid
+
+    def newest(self, limit: int = 500) -> list[Session]:
+        """Return the newest sessions, newest first."""
+        with self._open() as database:
+            rows = database.execute(f"SELECT {_COLUMNS} FROM session ORDER BY id DESC LIMIT ?", (limit,))
+            return [_session(row) for row in rows]
+
+    def load(self, number: int) -> tuple[Session, Exercise, Trace]:
+        """Read one session whole.
+
+        Raises
+        ------
+        InputError
+            If there is none with this number, or it is damaged.
+        """
+        with self._open() as database:
+            row = database.execute(
+                f"SELECT {_COLUMNS}, definition, trace FROM session WHERE id = ?", (number,)
+            ).fetchone()
+        if row is None:
+            raise InputError(f"there is no session {number} in {self.path}")
+        *columns, definition, trace = row
+        try:
+            exercise = Exercise.model_validate_json(definition)
+            return _session(columns), exercise, Trace.from_bytes(trace)
+        except (ValidationError, json.JSONDecodeError) as error:
+            raise InputError(f"session {number} in {self.path} is damaged: {error}") from error
+
+    @contextmanager
+    def _open(self) -> Iterator[sqlite3.Connection]:
+        database = sqlite3.connect(self.path, timeout=10.0)
+        try:
+            with database:
+                yield database
+        finally:
+            database.close()
+
+
+def _session(columns: Sequence[Any]) -> Session:
+    number, started, trainee, exercise, scene, model, scored = columns
+    return Session(number, started, trainee, exercise, scene, model, json.loads(scored))
+
+
+def sessions_csv(sessions: list[Session]) -> str:
+    """Sessions as CSV, one row each, oldest first; units are in the header."""
+    units = {"time": "s", "tissue_time": "s", "path_length": "mm", "path_inefficiency": "percent",
+             "tissue_damage": "mm2", "smoothness": "mm/s^2.5", "final_error": "mm", "target_shift": "mm"}  # fmt: skip
+    names = [field.name for field in fields(Score)]
+    out = io.StringIO()
+    writer = csv.writer(out)
+    writer.writerow(
+        ["id", "started", "trainee", "exercise", "scene", "model"]
+        + [f"{name} ({units[name]})" if name in units else name for name in names]
+    )
+    for session in reversed(sessions):
+        writer.writerow(
+            [session.id, session.started, _plain(session.trainee), _plain(session.exercise),
+             _plain(session.scene), session.model, *(session.score.get(name) for name in names)]
+        )  # fmt: skip
+    return out.getvalue()
+
+
+def trace_csv(trace: Trace) -> str:
+    """One session's trace as CSV: time, pose and the deformed target, one row per step."""
+    out = io.StringIO()
+    writer = csv.writer(out)
+    writer.writerow(
+        ["time (s)", "entry_x (mm)", "entry_y (mm)", "tip_x (mm)", "tip_y (mm)", "speed (mm/s)",
+         "target_x (mm)", "target_y (mm)"]
+    )  # fmt: skip
+    for time, pose, watched in zip(trace.times, trace.poses, trace.watched, strict=True):
+        writer.writerow([f"{time:.6f}", *(f"{v:.6f}" for v in (*pose, *watched[0]))])
+    return out.getvalue()
+
+
+def _plain(text: str) -> str:
+    """Text that no spreadsheet takes for a formula."""
+    return f"'{text}" if text[:1] in "=+-@\t\r" else text
