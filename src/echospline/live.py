@@ -137,8 +137,11 @@ class Snapshot:
         Whether the pose comes from a recording.
     failure : str or None
         What ended the model, if something did; a reset starts it again.
-    state : object
-        The model's state, for those who know the model.
+    offers_spline : bool
+        Whether this model's field is a spline.
+    spline : object or None
+        The field as a spline (landmarks, weights, motion, centre, scale, kernel) where the model offers it;
+        None where nothing is displaced.
     """
 
     step: int
@@ -153,7 +156,8 @@ class Snapshot:
     frozen: bool = False
     replaying: bool = False
     failure: str | None = None
-    state: object = None
+    offers_spline: bool = False
+    spline: object = None
 
 
 def follow(pose: NeedlePose, command: Command, dt: float, lag: float, fastest: float) -> NeedlePose:
@@ -446,6 +450,7 @@ class LiveEngine:
         displacement = self._model.displacement(self._state)
         if not np.isfinite(displacement).all():
             raise ArithmeticError("the displacement is not finite")
+        offered = getattr(self._model, "spline", None)
         watched = self._watch
         if len(watched):
             watched = watched + self._model.displacement_at(self._state, watched)
@@ -462,7 +467,8 @@ class LiveEngine:
             frozen=self._frozen,
             replaying=self._replay is not None,
             failure=self._failure,
-            state=self._state,
+            offers_spline=offered is not None,
+            spline=None if offered is None else offered(self._state),
         )
 
 

@@ -218,6 +218,10 @@ class TPSModel:
         points = np.asarray(points, dtype=np.float64)
         return np.zeros(points.shape) if state.field is None else state.field(points)
 
+    def spline(self, state: TPSState) -> Spline | None:
+        """Return the displacement field as a spline (it can be evaluated elsewhere); None where nothing is displaced."""
+        return state.field
+
     def advance(self, state: TPSState, pose: NeedlePose, dt: float) -> TPSState:
         """State after the needle has moved to ``pose`` in ``dt`` seconds, Algorithm 2.
 

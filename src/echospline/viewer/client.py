@@ -100,9 +100,7 @@ class Client:
         pose = newest.value.pose
         training = self.seat.training
         return {
-            "scene": self.seat.scene.describe(
-                _spline(self.seat.engine.model, newest.value.state) is not None
-            ),
+            "scene": self.seat.scene.describe(),
             "resumed": resumed,
             "pose": {"entry": pose.entry, "tip": pose.tip},
             "model": newest.value.model,
@@ -252,7 +250,6 @@ class Client:
             data = protocol.encode_frame(
                 snapshot,
                 self._sent,
-                spline=_spline(self.seat.engine.model, snapshot.state),
                 recording=training is not None and training.session is None,
             )
             async with self._sending:
@@ -291,12 +288,6 @@ class Client:
             code, reason = 1011, "the server has a fault; its log says more"
         if self.socket.application_state is WebSocketState.CONNECTED:
             await self.socket.close(code, reason.encode()[:120].decode("utf-8", "ignore"))
-
-
-def _spline(model: object, state: object) -> protocol.SplineLike | None:
-    """Return the field as a spline where the model offers it."""
-    offered = getattr(model, "spline", None)
-    return None if offered is None or state is None else offered(state)
 
 
 def resampled(trace: Trace, period: float) -> list[NeedlePose]:

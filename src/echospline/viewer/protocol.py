@@ -107,9 +107,7 @@ class SplineLike(Protocol):
     scale: float
 
 
-def encode_frame(
-    snapshot: Snapshot, number: int, *, spline: SplineLike | None = None, recording: bool = False
-) -> bytes:
+def encode_frame(snapshot: Snapshot, number: int, *, recording: bool = False, nodes: bool = False) -> bytes:
     """Frame as bytes.
 
     Parameters
@@ -118,10 +116,11 @@ def encode_frame(
         What to show.
     number : int
         Of the frame, ascending from 1 for each client.
-    spline : optional
-        The snapshot's field as a spline; sent instead of the nodes when given and nothing is compared.
     recording : bool
         Whether an exercise is being recorded.
+    nodes : bool
+        Send node displacements even where the model offers a spline; where two models are compared this is
+        always so.
     """
     reference = snapshot.reference
     largest = _largest(snapshot.displacement)
@@ -131,12 +130,11 @@ def encode_frame(
         | REPLAYING * snapshot.replaying
         | FAILED * (snapshot.failure is not None)
         | HAS_REFERENCE * (reference is not None)
-        | SPLINE * (spline is not None and reference is None)
+        | SPLINE * (snapshot.offers_spline and reference is None and not nodes)
         | RECORDING * recording
     )
     if flags & SPLINE:
-        assert spline is not None  # by the line above
-        count, field = len(spline.landmarks), _spline_bytes(spline)
+        count, field = _spline_bytes(snapshot.spline)
     else:
         count, field = len(snapshot.displacement), snapshot.displacement.astype("<f4").tobytes()
         if reference is not None:
@@ -204,23 +202,21 @@ SPLINE_HEAD = 12
 """float32 values before the landmarks: components, coupling, radius, centre x y, scale, motion 6."""
 
 
-def _spline_bytes(spline: SplineLike) -> bytes:
-    """Head, then (x, y, weight x, weight y) per landmark, all in conditioned coordinates."""
-    m, c = len(spline.landmarks), spline.kernel.components
-    kernel = spline.kernel
+def _spline_bytes(spline: Any) -> tuple[int, bytes]:
+    """Count of landmarks; head, then (x, y, weight x, weight y) per landmark, all in conditioned coordinates."""
     head = np.zeros(SPLINE_HEAD)
-    head[:6] = (
-        c,
-        getattr(kernel, "coupling", 0.0),
-        getattr(kernel, "radius", 0.0),
-        *spline.centre,
-        spline.scale,
-    )
-    head[6 : 6 + spline.motion.size] = spline.motion.ravel()
+    if spline is None:  # nothing is displaced
+        head[[0, 5]] = 1.0
+        return 0, head.astype("<f4").tobytes()
+    field: SplineLike = spline
+    m, c, kernel = len(field.landmarks), field.kernel.components, field.kernel
+    shape = getattr(kernel, "coupling", 0.0), getattr(kernel, "radius", 0.0)
+    head[:6] = (c, *shape, *field.centre, field.scale)
+    head[6 : 6 + field.motion.size] = field.motion.ravel()
     rows = np.empty((m, 4))
-    rows[:, :2] = (spline.landmarks - spline.centre) / spline.scale
-    rows[:, 2:] = spline.weights if c == 1 else spline.weights.reshape(2, m).T
-    return np.concatenate([head, rows.ravel()]).astype("<f4").tobytes()
+    rows[:, :2] = (field.landmarks - field.centre) / field.scale
+    rows[:, 2:] = field.weights if c == 1 else field.weights.reshape(2, m).T
+    return m, np.concatenate([head, rows.ravel()]).astype("<f4").tobytes()
 
 
 def _largest(displacement: NDArray[np.float64]) -> float:

@@ -82,7 +82,7 @@ class Scene:
         """One exercise by name."""
         return next((exercise for exercise in self.exercises if exercise.name == name), None)
 
-    def describe(self, models_spline: bool) -> dict[str, Any]:
+    def describe(self) -> dict[str, Any]:
         """Everything the page needs to know besides the pixels, as plain values."""
         (columns, rows), spacing, origin = (
             self.image.grid.shape,
@@ -97,7 +97,6 @@ class Scene:
             "models": [{"name": name, "label": label} for name, label in self.names],
             "needle": {"entry": self.entry, "angle": self.angle, "echo": echo},
             "exercises": [exercise.model_dump() for exercise in self.exercises],
-            "spline": models_spline,
         }
 
 

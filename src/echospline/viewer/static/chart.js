@@ -13,7 +13,7 @@ const INK = "#b8c7d1", FAINT = "#2b3740";
 
 /**
  * @param {HTMLCanvasElement} canvas
- * @param {{ lines: Line[], xLabel: string, yLabel: string, level?: number, levelLabel?: string }} plot
+ * @param {{ lines: Line[], xLabel: string, yLabel: string, level?: number, levelLabel?: string, counted?: boolean }} plot counted: x are whole numbers from 1
  */
 export function drawChart(canvas, plot) {
   const width = canvas.clientWidth || 480, height = canvas.clientHeight || 200, ratio = devicePixelRatio || 1;
@@ -25,7 +25,7 @@ export function drawChart(canvas, plot) {
   c.font = "12px system-ui, sans-serif";
   const xs = plot.lines.flatMap((line) => line.x), ys = plot.lines.flatMap((line) => line.y);
   if (!xs.length) return;
-  const x0 = Math.min(...xs), x1 = Math.max(...xs, x0 + 1e-6);
+  const x0 = plot.counted ? 1 : Math.min(0, ...xs), x1 = Math.max(...xs, x0 + (plot.counted ? 1 : 1e-6));
   const y1 = niceAbove(Math.max(...ys, plot.level ?? 0, 1e-6));
   const box = { left: 44, right: width - 12, top: 22, bottom: height - 34 };
   const px = (/** @type {number} */ x) => box.left + ((x - x0) / (x1 - x0)) * (box.right - box.left);
@@ -44,9 +44,10 @@ export function drawChart(canvas, plot) {
     c.fillText(short(y), box.left - 6, py(y));
   }
   c.textAlign = "center";
-  for (let k = 0; k <= 4; ++k) {
-    const x = x0 + ((x1 - x0) * k) / 4;
-    c.fillText(short(x), px(x), box.bottom + 12);
+  const steps = plot.counted ? Math.min(x1 - x0, 8) : 4;
+  for (let k = 0; k <= steps; ++k) {
+    const x = x0 + ((x1 - x0) * k) / steps;
+    c.fillText(short(plot.counted ? Math.round(x) : x), px(x), box.bottom + 12);
   }
   c.fillText(plot.xLabel, (box.left + box.right) / 2, height - 8);
   c.textAlign = "left";
@@ -87,7 +88,7 @@ export function drawChart(canvas, plot) {
 /** @param {number} value */
 function niceAbove(value) {
   const power = 10 ** Math.floor(Math.log10(value));
-  return power * ([1, 1.6, 2, 4, 6, 8, 10].find((step) => step * power >= value) ?? 10);
+  return power * ([1, 1.2, 1.6, 2, 2.4, 3.2, 4, 4.8, 6, 8, 10].find((step) => step * power >= value) ?? 10);
 }
 
 /** @param {number} value */

@@ -159,7 +159,7 @@ export class Training {
     if (past.length >= 2) {
       drawChart(progress, {
         lines: [{ label: "tip to target", colour: "#5fd4e0", x: past.map((_, k) => k + 1), y: past.map((s) => s.score.final_error), dots: true }],
-        xLabel: "session", yLabel: "mm", level: exercise.target.radius, levelLabel: "target radius",
+        xLabel: "session", counted: true, yLabel: "mm", level: exercise.target.radius, levelLabel: "target radius",
       });
     }
   }
@@ -207,7 +207,7 @@ export class Training {
     const past = this.stored.filter((session) => session.exercise === name && session.score.final_error !== null).reverse();
     drawChart(/** @type {HTMLCanvasElement} */ (byId("progress-plot")), {
       lines: [{ label: "tip to target, mm", colour: "#5fd4e0", x: past.map((_, k) => k + 1), y: past.map((s) => s.score.final_error), dots: true }],
-      xLabel: "session", yLabel: "mm",
+      xLabel: "session", counted: true, yLabel: "mm",
     });
   }
 

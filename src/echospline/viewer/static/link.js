@@ -125,7 +125,7 @@ export class Link {
    * @returns {Promise<Response>} a good one
    */
   async fetch(path, options = {}) {
-    const headers = this.token ? { Authorization: `Bearer ${this.token}` } : {};
+    const headers = new Headers(this.token ? { Authorization: `Bearer ${this.token}` } : undefined);
     const response = await fetch(path, { ...options, headers });
     if (!response.ok) throw new Error((await response.text()) || response.statusText);
     return response;

@@ -1,7 +1,7 @@
 // The page: one loop at the display's rate that takes the newest frame, draws it and reports.
 
 import { Controls, Needle } from "./controls.js";
-import { Training, byId, number } from "./exercise.js";
+import { Training, byId } from "./exercise.js";
 import { Link } from "./link.js";
 import { Overlay } from "./overlay.js";
 import { FROZEN, REPLAYING } from "./protocol.js";
@@ -318,12 +318,11 @@ function put(id, text) {
 
 /** @param {Frame} f */
 function readouts(f) {
-  put("depth", number(Math.hypot(f.tip[0] - f.entry[0], f.tip[1] - f.entry[1])));
+  put("depth", Math.hypot(f.tip[0] - f.entry[0], f.tip[1] - f.entry[1]).toFixed(1));
   put("angle", needle.angle.toFixed(1));
   put("speed", (Math.abs(f.speed) < 0.05 ? 0 : f.speed).toFixed(1));
   put("largest", f.largest.toFixed(2));
-  put("difference", f.difference.toFixed(2));
-  byId("difference-box").hidden = f.reference === null;
+  put("difference", f.reference ? f.difference.toFixed(2) : "–");
   const target = f.watched.length >= 2 && training.running;
   put("target", target ? Math.hypot(f.tip[0] - f.watched[0], f.tip[1] - f.watched[1]).toFixed(1) : "–");
   byId("frozen").hidden = !(f.flags & FROZEN);

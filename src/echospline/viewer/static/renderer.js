@@ -169,7 +169,7 @@ export class Renderer {
       if (frame.reference) this.attribute(2, this.buffers.other, frame.reference);
       else gl.disableVertexAttribArray(2);
     }
-    gl.uniform1i(this.at("landmarkCount"), spline ? frame.count : 0);
+    gl.uniform1i(this.at("landmarkCount"), spline ? frame.count : -1);
     gl.uniform1i(this.at("difference"), frame.reference ? 1 : 0);
     const [sx, sy, ox, oy] = view.toClip();
     gl.uniform4f(this.at("toClip"), sx, sy, ox, oy);

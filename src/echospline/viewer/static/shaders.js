@@ -6,7 +6,7 @@ in vec2 rest;       // mm
 in vec2 moved;      // displacement of this node, mm
 in vec2 other;      // the compared model's
 uniform vec4 toClip;             // scale x y, offset x y: mm to clip coordinates
-uniform int landmarkCount;       // 0: take \`moved\`
+uniform int landmarkCount;       // -1: take \`moved\`
 uniform highp sampler2D landmarks;  // (x, y, weight x, weight y), conditioned
 uniform vec4 kernel;             // components, coupling, radius, scale
 uniform vec2 centre;
@@ -37,7 +37,7 @@ vec2 splineAt(vec2 point) {
 }
 
 void main() {
-  vec2 u = landmarkCount > 0 ? splineAt(rest) : moved;
+  vec2 u = landmarkCount >= 0 ? splineAt(rest) : moved;
   vRest = rest;
   vWorld = rest + u;
   vField = difference ? u - other : u;
@@ -88,22 +88,25 @@ vec2 needle(vec2 p) {   // (brightness, transmission)
   float mirror = exp(-(tilt / look.z) * (tilt / look.z));
   float echo = look.w + (1.0 - look.w) * mirror;
   float light = 0.0;
-  if (traits.x != 0) {
+  float spacing = max(2.0 * radius, 3.0 * width), reach = 3.0 * (width + radius);
+  float deepest = reach + (traits.z != 0 ? 6.0 * spacing : 0.0);
+  bool near = d > -reach && d < deepest && s > -deepest && s < len + deepest;
+  if (near && traits.x != 0) {
     float u = len - s;
     float grain = 0.88 + 0.12 * sin(2.1 * u) * sin(0.73 * u + 1.0);
     float between = d / (radius + width);
     float line = min(wall(d + radius) + 0.6 * wall(d - radius) + 0.45 * exp(-between * between), 1.0);
     light += echo * grain * line * ends(s, len);
   }
-  if (traits.z != 0) {
-    float spacing = max(2.0 * radius, 3.0 * width), loss = 0.8;
+  if (near && traits.z != 0) {
+    float loss = 0.8;
     for (int k = 1; k <= 5; ++k) {
       loss *= 0.65;
       float shift = float(k + 1) * spacing;
       light += loss * echo * mirror * wall(d + radius - shift * facing) * ends(s - shift * drop, len);
     }
   }
-  if (traits.y != 0) {
+  if (near && traits.y != 0) {
     float w = width + 0.7 * radius;
     light = max(light, (0.85 + 0.15 * mirror) * exp(-dot(p - shaftEnds.zw, p - shaftEnds.zw) / (w * w)));
   }
@@ -135,7 +138,8 @@ void main() {
   vec3 shown = vec3(tone.z > 0.5 ? 1.0 - grey : grey);
   if (heat.x > 0.5) {
     float share = clamp(length(vField) / heat.y, 0.0, 1.0);
-    shown = mix(shown, texture(colours, vec2(share, 0.5)).rgb, heat.z * smoothstep(0.0, 0.12, share));
+    float cover = heat.z * smoothstep(0.0, 0.12, share) * (1.0 - min(1.4 * n.x, 1.0));  // the needle stays visible
+    shown = mix(shown, texture(colours, vec2(share, 0.5)).rgb, cover);
   }
   if (heat.w > 0.5) shown = mix(shown, vec3(0.35, 0.85, 0.95), 0.45 * linesAt(vRest));
   colour = vec4(shown, 1.0);
