@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from math import exp, hypot, isfinite
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -241,7 +242,7 @@ class _Requests:
     model: str | None = None
     compare: tuple[str | None] | None = None
     watch: Floats | None = None
-    replay: Iterator[NeedlePose] | None = None
+    replay: deque[NeedlePose] | None = None
 
 
 class LiveEngine:
@@ -301,7 +302,8 @@ class LiveEngine:
         self._pose = replace(home, speed=0.0)
         self._command = Command(home.entry, home.tip)
         self._watch: Floats = np.empty((0, 2))
-        self._replay: Iterator[NeedlePose] | None = None
+        self._replay: deque[NeedlePose] = deque()
+        self._replaying = False
         self._time, self._steps = 0.0, 0
         self._frozen = False
         self._failure: str | None = None
@@ -358,7 +360,7 @@ class LiveEngine:
     def replay(self, poses: Iterable[NeedlePose]) -> None:
         """Take the needle home and the tissue to rest, then one recorded pose per step instead of commands."""
         with self._lock:
-            self._requests.replay = iter(poses)
+            self._requests.replay = deque(poses)
 
     def observe(self, callback: Callable[[Snapshot], None]) -> None:
         """Call ``callback`` with every snapshot, in the stepping thread (a recorder misses no step)."""
@@ -400,7 +402,7 @@ class LiveEngine:
         return snapshot
 
     def _take(self, requests: _Requests) -> None:
-        if requests.command is not None:
+        if requests.command is not None and not self._replay:
             self._command = requests.command
         if requests.frozen is not None:
             self._frozen = requests.frozen
@@ -408,7 +410,7 @@ class LiveEngine:
             self._watch = requests.watch
         if requests.reset or requests.replay is not None:
             self._go_home()
-            self._replay = requests.replay
+            self._replay = requests.replay or deque()
             if requests.command is not None and requests.replay is None:
                 self._command = requests.command
         if requests.model is not None and requests.model != self._name:
@@ -428,15 +430,14 @@ class LiveEngine:
         self._state = self._model.rest()
         if self._other is not None:
             self._other = self._other[0], self._other[0].rest()
-        self._time, self._failure, self._replay = 0.0, None, None
+        self._time, self._failure = 0.0, None
+        self._replay.clear()
 
     def _advance(self) -> None:
-        if self._replay is not None:
-            pose = next(self._replay, None)
-            if pose is None:
-                self._replay = None
-                self._command = replace(self._command, entry=self._pose.entry, tip=self._pose.tip)
-                pose = replace(self._pose, speed=0.0)
+        self._replaying = bool(self._replay)
+        if self._replay:
+            pose = self._replay.popleft()
+            self._command = replace(self._command, entry=pose.entry, tip=pose.tip)
         else:
             pose = follow(self._pose, self._command, self.period, self._lag, self._fastest)
         self._state = self._model.advance(self._state, pose, self.period)
@@ -465,7 +466,7 @@ class LiveEngine:
             watched=watched,
             reference=None if self._other is None else self._other[0].displacement(self._other[1]),
             frozen=self._frozen,
-            replaying=self._replay is not None,
+            replaying=self._replaying,
             failure=self._failure,
             offers_spline=offered is not None,
             spline=None if offered is None else offered(self._state),

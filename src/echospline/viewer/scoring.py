@@ -107,7 +107,7 @@ class Trace:
             content = inflate.decompress(data[24:], size + 1)
         except zlib.error as error:
             raise InputError("a stored trace is damaged") from error
-        if len(content) != size:
+        if len(content) != size or not inflate.eof:
             raise InputError("a stored trace has another length than its head says")
         rows = np.frombuffer(content, "<f8").reshape(int(n), 5 + 2 * int(k))
         if not np.isfinite(rows).all():
