@@ -64,7 +64,7 @@ PAST = Exercise(
     name="past",
     title="Past the vessel",
     target=Disc(centre=(28.0, 18.0), radius=2.0),
-    vessels=(Disc(centre=(20.0, 10.0), radius=2.0),),
+    vessels=[Disc(centre=(20.0, 10.0), radius=2.0)],
     most_redirections=0,
 )
 

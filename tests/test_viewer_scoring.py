@@ -22,13 +22,12 @@ from echospline.errors import InputError
 from echospline.grid import RegularGrid
 from echospline.live import LiveEngine
 from echospline.needle import Insertion
+from echospline.scenario import load
 from echospline.viewer.exercise import (
     Disc,
     Exercise,
-    check_inside,
+    check_exercises,
     default_exercises,
-    parse_exercises,
-    read_exercises,
 )
 from echospline.viewer.scoring import Recorder, Trace, redirections, score, smoothness
 from echospline.viewer.sessions import Sessions, sessions_csv, trace_csv
@@ -41,7 +40,7 @@ def trace_of(insertion, exercise=EXERCISE, after=0.0, shift=(0.0, 0.0)):
     times = np.arange(1, round((insertion.duration + after) / PERIOD) + 1) * PERIOD
     poses = [insertion.pose(t) for t in times]
     rows = np.array([(*p.entry, *p.tip, p.speed) for p in poses])
-    watched = np.repeat(exercise.landmarks[None] + shift, len(rows), axis=0)
+    watched = np.repeat(np.array(exercise.landmarks)[None] + shift, len(rows), axis=0)
     return Trace(PERIOD, rows, watched)
 
 
@@ -214,39 +213,49 @@ def test_a_damaged_trace_is_refused(spoil):
 # --- exercises
 
 
-def test_exercises_are_read_from_a_scenario(tmp_path):
-    file = tmp_path / "scenario.toml"
-    file.write_text(
-        '[image]\npath = "a.png"\n[[exercise]]\nname = "a"\ntitle = "A"\n'
-        "target = { centre = [20.0, 12.0], radius = 2 }\nvessels = [{ centre = [1, 2], radius = 3 }]\n"
-    )
-    (exercise,) = read_exercises(file)
-    assert exercise.target.centre == (20.0, 12.0)
-    assert exercise.landmarks.shape == (2, 2)
+SCENARIO = """format = 1
+[[exercise]]
+name = "a"
+title = "A"
+target = { centre = [20.0, 12.0], radius = 2 }
+vessels = [{ centre = [1, 2], radius = 3 }]
+"""
+
+
+def test_exercises_are_read_from_a_scenario_and_written_back(tmp_path):
+    (tmp_path / "scenario.toml").write_text(SCENARIO)
+    loaded = load(tmp_path / "scenario.toml")
+    assert loaded.exercise[0].landmarks == [(20.0, 12.0), (1.0, 2.0)]
+    loaded.save(tmp_path / "again.toml", tmp_path)
+    assert load(tmp_path / "again.toml").exercise == loaded.exercise
 
 
 @pytest.mark.parametrize(
-    ("tables", "match"),
+    ("old", "new", "match"),
     [
-        ([{"name": "a"}], "exercise 1: title"),
-        ([{"name": "a", "title": "A", "target": {"centre": [1, float("nan")], "radius": 1}}], "finite"),
-        ([{"name": "a", "title": "A", "target": {"centre": [1, 2], "radius": -1}}], "radius"),
-        ([{"name": "a", "title": "A", "target": {"centre": [1, 2], "radius": 1}, "colour": 1}], "colour"),
-        ([{"name": "a", "title": "A", "target": {"centre": [1, 2], "radius": 1}}] * 2, "names must differ"),
-        ("exercise", "tables"),
+        ('title = "A"', "", r"exercise\.0\.title is missing"),
+        ("[20.0, 12.0]", "[nan, 1]", "centre"),
+        ("radius = 2", "radius = -1", "radius"),
+        ('title = "A"', 'title = "A"\ncolour = 1', "colour is not a known key"),
     ],
 )
-def test_wrong_exercises_are_refused_by_name(tables, match):
+def test_wrong_exercises_are_refused_by_name(tmp_path, old, new, match):
+    (tmp_path / "scenario.toml").write_text(SCENARIO.replace(old, new))
     with pytest.raises(InputError, match=match):
-        parse_exercises(tables, "here.toml")
+        load(tmp_path / "scenario.toml")
+
+
+def test_two_exercises_of_one_name_are_refused():
+    with pytest.raises(InputError, match="names must differ"):
+        check_exercises([EXERCISE, EXERCISE], scene().grid)
 
 
 def test_a_target_outside_the_image_is_refused_and_the_default_ones_fit_any():
     outside = Exercise(name="a", title="A", target=Disc(centre=(99.0, 1.0), radius=1.0))
     with pytest.raises(InputError, match="must lie in the image"):
-        check_inside([outside], scene().grid)
+        check_exercises([outside], scene().grid)
     for grid in (RegularGrid((5, 90), (3.0, 1.0), (-10.0, 4.0)), scene().grid):
-        check_inside(default_exercises(grid), grid)
+        check_exercises(default_exercises(grid), grid)
 
 
 # --- sessions

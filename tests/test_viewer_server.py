@@ -220,20 +220,27 @@ def test_a_reload_resumes_where_the_page_was(address):
         assert not odd.hello["resumed"]
 
 
+def engines():
+    return sum(thread.name == "echospline-engine" for thread in threading.enumerate())
+
+
+def wait_for(condition, timeout=15.0):
+    until = time.monotonic() + timeout
+    while not condition():
+        assert time.monotonic() < until
+        time.sleep(0.02)
+
+
 def test_a_client_that_vanishes_frees_its_engine(server):
     address, _, app = server
-    engines = lambda: sum(t.name == "echospline-engine" for t in threading.enumerate())  # noqa: E731
-    before = engines()
+    wait_for(lambda: engines() == 0)  # those of the tests before
     with ExitStack() as stack:
         clients = [stack.enter_context(page(address)) for _ in range(4)]
-        assert engines() == before + 4
+        wait_for(lambda: engines() == 4)
         for client in clients:
             client.socket.socket.shutdown(2)  # the cable is cut: no closing handshake
-    until = time.monotonic() + 15
-    while engines() > before and time.monotonic() < until:
-        time.sleep(0.05)
-    assert engines() == before
-    assert app.state.room.clients == 0
+        wait_for(lambda: engines() == 0)
+    wait_for(lambda: app.state.room.clients == 0)
 
 
 # --- training

@@ -25,6 +25,7 @@ from echospline.io.part import give_name, part_of
 from echospline.needle import Insertion
 from echospline.needle_echo import NeedleEcho
 from echospline.sections import (
+    ExerciseSection,
     ImageSection,
     MeshSection,
     ModelSection,
@@ -54,6 +55,7 @@ class Scenario(Section):
     needle: NeedleSection = NeedleSection()
     model: ModelSection = ModelSection()
     output: OutputSection = OutputSection()
+    exercise: list[ExerciseSection] = Field(default=[], description="what can be trained live")
 
     def with_values(self, values: Mapping[str, Any], origin: str = "scenario") -> Scenario:
         """Return a copy with some keys changed, ``{"needle.depth": 20}``, validated.

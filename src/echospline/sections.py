@@ -210,3 +210,31 @@ class OutputSection(Section):
         0.0, description="value where no tissue comes to lie"
     )
     folding: Literal["flag", "refuse"] = Field("flag", description="what happens when the picture folds")
+
+
+class DiscSection(Section):
+    """A round structure; it moves with the tissue."""
+
+    centre: Point = Field(description="where it lies at rest (x lateral, y depth), mm")
+    radius: Millimetres = Field(gt=0, le=100, description="mm")
+
+
+class ExerciseSection(Section):
+    """What a trainee shall do in the live simulator."""
+
+    name: str = Field(
+        min_length=1, max_length=80, description="short and unique; sessions are listed under it"
+    )
+    title: str = Field(min_length=1, max_length=80, description="for the page")
+    goal: str = Field("", max_length=400, description="one or two sentences for the page")
+    target: DiscSection = Field(
+        description="where the tip shall end; hit inside the radius of the deformed target"
+    )
+    vessels: list[DiscSection] = Field(default=[], max_length=20, description="what the needle may not touch")
+    most_redirections: int | None = Field(None, ge=0, description="turns inside the tissue that are allowed")
+    time_limit: Seconds = Field(120.0, gt=0, le=1800, description="the recording ends by itself, s")
+
+    @property
+    def landmarks(self) -> list[tuple[float, float]]:
+        """Centres of target and vessels at rest, mm: what is watched while the tissue moves."""
+        return [self.target.centre, *(vessel.centre for vessel in self.vessels)]

@@ -7,6 +7,8 @@ import sys
 import typer
 
 from echospline.cli.info import info
+from echospline.cli.live import live
+from echospline.cli.sessions import sessions
 from echospline.cli.simulate import demo, simulate
 from echospline.errors import EchosplineError
 
@@ -23,6 +25,8 @@ app = typer.Typer(
 app.command()(simulate)
 app.command()(demo)
 app.command()(info)
+app.command()(live)
+app.add_typer(sessions, name="sessions")
 
 
 def main() -> None:

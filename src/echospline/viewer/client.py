@@ -203,6 +203,7 @@ class Client:
                 trainee=training.trainee,
                 scene=self.seat.scene.title,
                 model=model,
+                source=self.seat.scene.source,
             )
         history = [
             {"id": s.id, "started": s.started, "score": s.score}

@@ -1,119 +1,32 @@
-"""Exercises: a target in the tissue, perhaps vessels to avoid, and what counts as done."""
+"""Exercises: a target in the tissue, perhaps vessels to avoid, and what counts as done.
+
+They are the ``[[exercise]]`` tables of a scenario; three come with any image.
+"""
 
 from __future__ import annotations
 
-import tomllib
-from collections.abc import Iterable
-from math import isfinite
-from pathlib import Path
-from typing import Any
-
-import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from collections.abc import Sequence
 
 from echospline.errors import InputError
-from echospline.grid import Floats, RegularGrid
+from echospline.grid import RegularGrid
+from echospline.sections import DiscSection as Disc
+from echospline.sections import ExerciseSection as Exercise
 
-Point = tuple[float, float]
-
-
-class Disc(BaseModel):
-    """A round structure in the imaging plane; it moves with the tissue.
-
-    Parameters
-    ----------
-    centre : (x, y)
-        At rest, mm.
-    radius : float
-        mm, positive.
-    """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    centre: Point
-    radius: float = Field(gt=0, le=100)
-
-    @field_validator("centre")
-    @classmethod
-    def _finite(cls, value: Point) -> Point:
-        if not all(isfinite(c) for c in value):
-            raise ValueError("must be two finite numbers in mm")
-        return value
+__all__ = ["Disc", "Exercise", "check_exercises", "default_exercises"]
 
 
-class Exercise(BaseModel):
-    """What a trainee shall do.
-
-    Parameters
-    ----------
-    name : str
-        Short and unique; sessions are listed under it.
-    title, goal : str
-        For the page.
-    target : Disc
-        Where the tip shall end; hit when it lies within the radius of the *deformed* target.
-    vessels : tuple of Disc
-        The needle may not touch them.
-    most_redirections : int, optional
-        More of them fail the exercise.
-    time_limit : float
-        s; the recording ends there by itself.
-    """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    name: str = Field(min_length=1, max_length=80)
-    title: str = Field(min_length=1, max_length=80)
-    goal: str = Field(default="", max_length=400)
-    target: Disc
-    vessels: tuple[Disc, ...] = Field(default=(), max_length=20)
-    most_redirections: int | None = Field(default=None, ge=0)
-    time_limit: float = Field(default=120.0, gt=0, le=1800)
-
-    @property
-    def landmarks(self) -> Floats:
-        """Centres of target and vessels at rest, shape (1 + vessels, 2), mm: what the engine watches."""
-        return np.array([self.target.centre, *(vessel.centre for vessel in self.vessels)])
-
-
-def read_exercises(path: Path) -> tuple[Exercise, ...]:
-    """Read the ``[[exercise]]`` tables of a TOML file (a scenario, for one); none is an empty tuple.
+def check_exercises(exercises: Sequence[Exercise], grid: RegularGrid) -> None:
+    """Check what the tables alone cannot tell.
 
     Raises
     ------
     InputError
-        If the file is no TOML or a table is not an exercise.
+        If two share a name, or a target or vessel lies outside the mesh.
     """
-    try:
-        with path.open("rb") as file:
-            content = tomllib.load(file)
-    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read exercises from {path}: {error}") from error
-    return parse_exercises(content.get("exercise", []), str(path))
-
-
-def parse_exercises(tables: Iterable[Any], source: str) -> tuple[Exercise, ...]:
-    """Check exercise tables; ``source`` is where they come from, for the message."""
-    exercises: list[Exercise] = []
-    if not isinstance(tables, list | tuple):
-        raise InputError(f"{source}: exercises are written as [[exercise]] tables")
-    for number, table in enumerate(tables, 1):
-        try:
-            exercises.append(Exercise.model_validate(table))
-        except ValidationError as error:
-            first = error.errors()[0]
-            where = ".".join(str(part) for part in first["loc"])
-            raise InputError(f"{source}: exercise {number}: {where}: {first['msg']}") from error
     names = [exercise.name for exercise in exercises]
-    for name in names:
-        if names.count(name) > 1:
-            raise InputError(f"{source}: two exercises are called {name!r}; names must differ")
-    return tuple(exercises)
-
-
-def check_inside(exercises: Iterable[Exercise], grid: RegularGrid) -> None:
-    """Refuse exercises whose target or vessels lie outside the mesh."""
     for exercise in exercises:
+        if names.count(exercise.name) > 1:
+            raise InputError(f"two exercises are called {exercise.name!r}; names must differ")
         if not grid.contains(exercise.landmarks).all():
             x0, x1, y0, y1 = grid.extent
             raise InputError(
@@ -149,6 +62,6 @@ def default_exercises(grid: RegularGrid) -> tuple[Exercise, ...]:
             title="Past the vessel",
             goal="Reach the target behind the vessel without touching the vessel.",
             target=disc(0.55, 0.62, 0.035),
-            vessels=(disc(0.54, 0.36, 0.07),),
+            vessels=[disc(0.54, 0.36, 0.07)],
         ),
     )

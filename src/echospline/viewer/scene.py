@@ -17,7 +17,7 @@ from echospline.image import UltrasoundImage
 from echospline.live import ModelFactory
 from echospline.needle import NeedlePose
 from echospline.needle_echo import NeedleEcho
-from echospline.viewer.exercise import Exercise, check_inside
+from echospline.viewer.exercise import Exercise, check_exercises
 
 LARGEST_SIDE = 4096
 """Pixels; what every WebGL2 browser takes as a texture is at least 2048, nearly all take this."""
@@ -47,6 +47,8 @@ class Scene:
         Its looks.
     exercises : tuple of Exercise
         What can be trained here.
+    source : str
+        What this scene was made from, kept with each session so that it can be run again; opaque here.
 
     Raises
     ------
@@ -63,6 +65,7 @@ class Scene:
     angle: float = 60.0
     echo: NeedleEcho = field(default_factory=NeedleEcho)
     exercises: tuple[Exercise, ...] = ()
+    source: str = ""
 
     def __post_init__(self) -> None:
         if max(self.image.grid.shape) > LARGEST_SIDE:
@@ -71,7 +74,7 @@ class Scene:
             )
         if not self.names:
             raise InputError("a scene needs one model or more")
-        check_inside(self.exercises, self.grid)
+        check_exercises(self.exercises, self.grid)
 
     @property
     def home(self) -> NeedlePose:

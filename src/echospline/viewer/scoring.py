@@ -243,7 +243,7 @@ def score(trace: Trace, exercise: Exercise) -> Score:
         redirections=turned,
         smoothness=smoothness(trace),
         final_error=error,
-        target_shift=float(np.hypot(*(trace.watched[-1, 0] - exercise.target.centre))),
+        target_shift=float(np.hypot(*(trace.watched[-1, 0] - np.array(exercise.target.centre)))),
         vessel_contacts=sum(touched),
     )
 

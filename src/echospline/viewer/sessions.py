@@ -27,13 +27,14 @@ CREATE TABLE IF NOT EXISTS session (
   trainee TEXT NOT NULL,
   exercise TEXT NOT NULL,     -- name
   definition TEXT NOT NULL,   -- the exercise as JSON: it can be scored again when the scenario is gone
-  scene TEXT NOT NULL,
+  scene TEXT NOT NULL,        -- title
+  source TEXT NOT NULL,       -- what the scene was made from (a scenario as JSON)
   model TEXT NOT NULL,
   score TEXT NOT NULL,        -- JSON
   trace BLOB NOT NULL
 )
 """
-_COLUMNS = "id, started, trainee, exercise, scene, model, score"
+_COLUMNS = "id, started, trainee, exercise, scene, model, source, score"
 
 
 @dataclass(frozen=True)
@@ -46,11 +47,12 @@ class Session:
     exercise: str
     scene: str
     model: str
+    source: str
     score: dict[str, Any]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        """Plain values for JSON, without the source."""
+        return {field.name: getattr(self, field.name) for field in fields(self) if field.name != "source"}
 
 
 class Sessions:
@@ -87,17 +89,25 @@ class Sessions:
             ) from error
 
     def add(
-        self, exercise: Exercise, trace: Trace, score: Score, *, trainee: str, scene: str, model: str
+        self,
+        exercise: Exercise,
+        trace: Trace,
+        score: Score,
+        *,
+        trainee: str,
+        scene: str,
+        model: str,
+        source: str = "",
     ) -> int:
         """Store a session in one transaction; returns its id."""
         row = (
             datetime.now(UTC).isoformat(timespec="seconds"), trainee, exercise.name,
-            exercise.model_dump_json(), scene, model, json.dumps(score.to_dict()), trace.to_bytes(),
+            exercise.model_dump_json(), scene, source, model, json.dumps(score.to_dict()), trace.to_bytes(),
         )  # fmt: skip
         with self._open() as database:
             cursor = database.execute(
-                "INSERT INTO session (started, trainee, exercise, definition, scene, model, score, trace) "
-                "VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+                "INSERT INTO session (started, trainee, exercise, definition, scene, source, model, score, trace) "
+                "VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
                 row,
             )
             assert cursor.lastrowid is not None  # an INSERT has one
@@ -141,8 +151,8 @@ class Sessions:
 
 
 def _session(columns: Sequence[Any]) -> Session:
-    number, started, trainee, exercise, scene, model, scored = columns
-    return Session(number, started, trainee, exercise, scene, model, json.loads(scored))
+    number, started, trainee, exercise, scene, model, source, scored = columns
+    return Session(number, started, trainee, exercise, scene, model, source, json.loads(scored))
 
 
 def sessions_csv(sessions: list[Session]) -> str:

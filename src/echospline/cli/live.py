@@ -1,0 +1,134 @@
+"""``echospline live``: steer the needle in the browser."""
+
+from __future__ import annotations
+
+import logging
+import os
+import webbrowser
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from threadpoolctl import threadpool_limits
+
+from echospline.cli.options import scenario_from, with_scenario_options
+from echospline.errors import InputError
+from echospline.image import UltrasoundImage
+from echospline.models import MODELS, build_model
+from echospline.needle_echo import NeedleEcho
+from echospline.scenario import Scenario
+from echospline.viewer.exercise import default_exercises
+from echospline.viewer.scene import Scene
+from echospline.viewer.server import Settings, build_app, serve
+from echospline.viewer.sessions import Sessions
+
+LABELS = {"tps": "Thin plate", "elastic": "Elastic", "green": "Green", "fem": "FEM"}
+
+
+def default_sessions() -> Path:
+    """Return the file that keeps a user's training sessions."""
+    home = os.environ.get("XDG_DATA_HOME") or str(Path.home() / ".local" / "share")
+    return Path(home) / "echospline" / "sessions.sqlite"
+
+
+@with_scenario_options
+def live(
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="[IMAGE_OR_SCENARIO]",
+            help="an image, cine or DICOM file, sample:calf, or a scenario (.toml) with its exercises",
+        ),
+    ] = "sample:calf",
+    host: Annotated[
+        str,
+        typer.Option(help="address to listen on; anything but this machine's own asks pages for a token"),
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="port; 0 takes any free one")] = 8750,
+    rate: Annotated[float, typer.Option(min=10, max=1000, help="model steps per second")] = 120.0,
+    clients: Annotated[int, typer.Option(min=1, max=1000, help="most pages at once")] = 64,
+    sessions: Annotated[
+        Path | None,
+        typer.Option(help="file that keeps training sessions; by default in the user's data folder"),
+    ] = None,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="open the page")] = True,
+    changes: dict[str, Any] | None = None,
+) -> None:
+    """Steer the needle in the browser and see the tissue move.
+
+    Starts a server on this machine and opens its page; Ctrl+C ends it. Without an argument it shows the image that ships
+    inside. Finished exercises are kept (`echospline sessions` lists and exports them).
+    """
+    scenario, folder = scenario_from(source, changes or {})
+    image = scenario.read_image(folder)
+    scene = scene_of(scenario, image, folder)
+    settings = Settings(host, port, rate, clients)
+    kept = Sessions(sessions or default_sessions())
+    app = build_app(scene, kept, settings, opener_for(scenario))
+    console = Console(stderr=True)
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
+
+    def ready(address: str) -> None:
+        console.print(f"steer the needle at [bold]{address}[/]", highlight=False, soft_wrap=True)
+        console.print(f"sessions are kept in {kept.path}; Ctrl+C ends", highlight=False, soft_wrap=True)
+        if browser:
+            webbrowser.open(address)
+
+    with threadpool_limits(limits=1):  # an engine's step is short: more threads make it slower, and late
+        serve(app, settings, ready)
+
+
+def scene_of(scenario: Scenario, image: UltrasoundImage, folder: Path) -> Scene:
+    """Scene of a scenario: its image, mesh and needle, every model, its exercises or the usual three.
+
+    Raises
+    ------
+    InputError
+        If the point of entry lies outside the image.
+    """
+    grid = scenario.grid(image)
+    needle = scenario.needle
+    entry, angle = (needle.entry, needle.angle)
+    if not grid.contains(entry).all():
+        x0, x1, y0, y1 = grid.extent
+        raise InputError(
+            f"needle.entry must lie in the image, x from {x0:g} to {x1:g} and y from {y0:g} to {y1:g} mm; got {entry}"
+        )
+    first = scenario.model.kind
+    kept = scenario.model_copy(
+        update={"image": scenario.image.model_copy(update={"file": _whole(scenario, folder)})}
+    )
+    return Scene(
+        title=scenario.title or Path(scenario.image.file.removeprefix("sample:")).stem,
+        image=image,
+        grid=grid,
+        models=lambda kind: build_model(scenario, grid, kind=kind, folder=folder),
+        names=tuple((kind, LABELS[kind]) for kind in sorted(MODELS, key=lambda kind: kind != first)),
+        entry=entry,
+        angle=angle,
+        echo=scenario.needle_echo() or NeedleEcho(shaft=False, tip=False, reverberation=False, shadow=False),
+        exercises=tuple(scenario.exercise) or default_exercises(grid),
+        source=kept.model_dump_json(),
+    )
+
+
+def _whole(scenario: Scenario, folder: Path) -> str:
+    """Name of the image that is valid from anywhere."""
+    file = scenario.image.file
+    return file if file.startswith("sample:") else str((folder / file).resolve())
+
+
+def opener_for(scenario: Scenario) -> Callable[[Path, tuple[float, float] | None], Scene]:
+    """Make uploaded images into scenes with the tissue, mesh and model of a scenario."""
+
+    def opened(path: Path, spacing: tuple[float, float] | None) -> Scene:
+        values: dict[str, Any] = {"title": "Your image", "image.file": str(path), "image.spacing": spacing, "image.frame": 0,
+                  "image.region": None, "tissue.region": [], "mesh.clamped_points": [], "exercise": []}  # fmt: skip
+        bare = scenario.with_values(values, "upload")
+        image = bare.read_image(path.parent)
+        x0, x1, y0, _ = bare.grid(image).extent
+        return scene_of(bare.with_values({"needle.entry": (x0 + 0.2 * (x1 - x0), y0)}), image, path.parent)
+
+    return opened

@@ -1,0 +1,127 @@
+"""``echospline sessions``: list, export and score again what was trained, and make a cine of it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from echospline.cli.live import default_sessions
+from echospline.errors import InputError
+from echospline.models import build_model
+from echospline.run import run
+from echospline.scenario import validated
+from echospline.viewer.scoring import Trace, score
+from echospline.viewer.sessions import Sessions, sessions_csv, trace_csv
+
+sessions = typer.Typer(
+    no_args_is_help=True, help="Training sessions: list, export, score again, make a cine."
+)
+
+Kept = Annotated[
+    Path | None, typer.Option("--sessions", help="file of sessions; by default in the user's data folder")
+]
+Number = Annotated[int, typer.Argument(min=1, metavar="SESSION", help="number in the list")]
+KEYFRAMES_PER_SECOND = 60.0
+
+
+@sessions.command("list")
+def list_(
+    kept: Kept = None,
+    json_: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
+) -> None:
+    """List the sessions, newest first."""
+    found = _open(kept).newest()
+    if json_:
+        print(json.dumps([session.to_dict() for session in found], indent=2))
+        return
+    table = Table(title=f"{len(found)} sessions", title_justify="left")
+    for name in (
+        "no.",
+        "started (UTC)",
+        "trainee",
+        "exercise",
+        "model",
+        "result",
+        "tip to target mm",
+        "time s",
+    ):
+        table.add_column(name)
+    for s in found:
+        error = s.score["final_error"]
+        table.add_row(
+            str(s.id), s.started[:16].replace("T", " "), s.trainee, s.exercise, s.model,
+            "passed" if s.score["passed"] else "not passed", "-" if error is None else f"{error:.2f}",
+            f"{s.score['time']:.1f}",
+        )  # fmt: skip
+    Console().print(table, markup=False)
+
+
+@sessions.command()
+def export(
+    out: Annotated[Path, typer.Argument(metavar="FILE.csv", help="where to write")],
+    number: Annotated[
+        int | None, typer.Option("--session", min=1, help="the trace of this one, instead of the list")
+    ] = None,
+    kept: Kept = None,
+) -> None:
+    """Write the sessions, or the trace of one, as CSV."""
+    stored = _open(kept)
+    text = sessions_csv(stored.newest(1_000_000)) if number is None else trace_csv(stored.load(number)[2])
+    part = out.with_name(out.name + ".part")
+    try:
+        part.write_text(text, encoding="utf-8", newline="")
+        part.replace(out)
+    except OSError as error:
+        raise InputError(f"cannot write {out}: {error.strerror}") from error
+
+
+@sessions.command()
+def rescore(number: Number, kept: Kept = None) -> None:
+    """Score a stored session again from its trace, and print both scores as JSON."""
+    session, exercise, trace = _open(kept).load(number)
+    print(json.dumps({"stored": session.score, "now": score(trace, exercise).to_dict()}, indent=2))
+
+
+@sessions.command()
+def cine(
+    number: Number,
+    out: Annotated[Path, typer.Option("--out", help="folder for the results")] = Path("out"),
+    kept: Kept = None,
+) -> None:
+    """Run a stored session's needle again: the cine with its true motion, as `echospline simulate` writes it."""
+    session, _, trace = _open(kept).load(number)
+    if not session.source:
+        raise InputError(
+            f"session {number} does not say what its scene was made from, so it cannot be run again"
+        )
+    scenario = validated(json.loads(session.source), f"session {number}").with_values(
+        {"needle.path": keyframes(trace), "model.kind": session.model}, f"session {number}"
+    )
+    folder = Path.cwd()
+    image = scenario.read_image(folder)
+    report = run(scenario, image, build_model(scenario, scenario.grid(image), folder=folder), out, folder)
+    print(f"results in {out}: {', '.join(report['files'])}")
+
+
+def keyframes(trace: Trace) -> list[tuple[float, float, float, float, float]]:
+    """Rows of time, entry and tip for a scenario's path, at most 60 a second, first and last included."""
+    if len(trace) < 2:
+        raise InputError("this session holds no motion")
+    stride = max(1, int(1.0 / (KEYFRAMES_PER_SECOND * trace.period)))
+    rows = np.unique([*range(0, len(trace), stride), len(trace) - 1])
+    columns = np.column_stack([trace.times, trace.entry, trace.tip])[rows]
+    columns[:, 0] -= columns[0, 0]
+    return [(float(t), float(ex), float(ey), float(tx), float(ty)) for t, ex, ey, tx, ty in columns]
+
+
+def _open(kept: Path | None) -> Sessions:
+    path = kept or default_sessions()
+    if not path.exists():
+        raise InputError(f"there are no sessions in {path}: finish an exercise in `echospline live` first")
+    return Sessions(path)
