@@ -257,3 +257,14 @@ def test_a_scene_that_nothing_holds_is_refused():
         TPSModel(GRID, clamped=("left",))
     with pytest.raises(InputError, match="dt must be"):
         TPSModel(GRID).advance(TPSModel(GRID).rest(), NeedlePose((0, 0), (0, 0)), -1.0)
+
+
+def test_default_friction_throws_no_tissue_backwards():
+    # a steep profile across the shaft makes a thin plate swing back beside the needle; the defaults must not
+    path = Insertion.straight((8, 0), 45, 25, 10.0)
+    axis = np.array([1.0, 1.0]) / np.sqrt(2)
+    along = TPSModel(GRID).displacement(drive(TPSModel(GRID), path, 1 / 20)) @ axis
+    assert along.max() > 0.9
+    assert along.min() > -0.05
+    steep = TPSModel(GRID, parameters=TPSParameters(alpha1=0.04, alpha2=0.2))
+    assert (steep.displacement(drive(steep, path, 1 / 20)) @ axis).min() < -0.5
