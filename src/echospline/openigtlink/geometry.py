@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,8 @@ from echospline.openigtlink.header import pack_name
 _POINT = struct.Struct(">64s32s4B3ff20s")
 _POLYDATA = struct.Struct(">10I")
 _ATTRIBUTE = struct.Struct(">BBI")
-Cells = tuple[tuple[int, ...], ...]
+Cells = Sequence[Sequence[int]] | NDArray[np.integer[Any]]
+"""Cells by the indices of their points: tuples of any length, or an array (cells, corners)."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,7 @@ class PolyData:
     ----------
     points : ndarray, shape (n, 3)
         mm, RAS.
-    vertices, lines, polygons, strips : tuple of tuple of int
+    vertices, lines, polygons, strips : tuple of tuple of int, or ndarray of int, shape (cells, corners)
         Cells by the indices of their points.
     attributes : tuple of Attribute
         What is known at points or cells, such as the displacement.
@@ -149,11 +150,16 @@ def _text(raw: bytes) -> str:
     return raw.split(b"\0", 1)[0].decode("utf-8", "replace")
 
 
-def _pack_cells(cells: Sequence[Sequence[int]], points: int) -> tuple[int, bytes]:
-    flat = [i for cell in cells for i in (len(cell), *cell)]
-    if any(not 0 <= i < points for cell in cells for i in cell):
+def _pack_cells(cells: Cells, points: int) -> tuple[int, bytes]:
+    if isinstance(cells, np.ndarray):
+        named = cells.ravel()
+        flat = np.insert(cells, 0, cells.shape[1], axis=1)
+    else:
+        named = np.array([i for cell in cells for i in cell], dtype=np.int64)
+        flat = np.array([i for cell in cells for i in (len(cell), *cell)], dtype=np.int64)
+    if named.size and not (named.min() >= 0 and named.max() < points):
         raise InputError(f"a cell of a POLYDATA names its points by 0 to {points - 1}")
-    return len(cells), np.array(flat, dtype=">u4").tobytes()
+    return len(cells), flat.astype(">u4").tobytes()
 
 
 def _unpack_cells(data: memoryview, count: int, points: int) -> Cells:

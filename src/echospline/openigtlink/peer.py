@@ -224,20 +224,20 @@ class Peer(asyncio.Protocol):
         self.version = max(self.version, min(message.version, 2))
         content = message.content
         if isinstance(content, Unread):
-            kind = (content.type, content.reason)
-            if kind not in self._complained and len(self._complained) < 100:
-                self._complained.add(kind)
-                what = content.reason or "echospline does not know this type"
-                log.warning(
-                    "a %s of %s from %s is passed over: %s", content.type, message.device, self.name, what
-                )
+            self._complain(message, "passed over", content.reason or "echospline does not know this type")
             return
         if len(self.speaks) < 1000:
             self.speaks.add((message.type, message.device))
         try:
             self._received(self, message)
         except InputError as error:
-            log.warning("a %s of %s from %s is refused: %s", message.type, message.device, self.name, error)
+            self._complain(message, "refused", str(error))
+
+    def _complain(self, message: Message, fate: str, reason: str) -> None:
+        """Log once per reason: a tracker repeats itself a thousand times a second."""
+        if (message.type, reason) not in self._complained and len(self._complained) < 100:
+            self._complained.add((message.type, reason))
+            log.warning("a %s of %s from %s is %s: %s", message.type, message.device, self.name, fate, reason)
 
     def pause_writing(self) -> None:
         """Hold further messages: the system has no room."""

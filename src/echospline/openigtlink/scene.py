@@ -254,5 +254,8 @@ class Visible:
         """Return this piece of a needle; of depth 0 if it lies above the entry."""
         (x, y), (ax, ay) = pose.tip, pose.axis if pose.depth > 0 else (0.0, 1.0)
         near = min(self.near, pose.depth)
-        far = near if near < self.near else min(self.far, max(pose.depth, near + CROSS_SECTION))
+        if self.far - self.near <= CROSS_SECTION:  # a dot, whatever the depth in the plane
+            far = near + CROSS_SECTION if near == self.near else near
+        else:
+            far = max(near, min(self.far, pose.depth))
         return NeedlePose((x - far * ax, y - far * ay), (x - near * ax, y - near * ay), pose.speed)

@@ -1,0 +1,117 @@
+"""Orders from peers: STRING (as PLUS and Slicer's remote control send them, or plain words) and COMMAND; their answers."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from xml.etree import ElementTree
+from xml.sax.saxutils import quoteattr
+
+from echospline.errors import InputError
+from echospline.openigtlink.message import Message
+from echospline.openigtlink.text import UNKNOWN_ERROR, Command, CommandReply, Status, String
+
+LONGEST = 16 * 1024
+"""Characters of an order."""
+
+NAMES = {
+    "start": "start", "stop": "stop", "reset": "reset", "freeze": "freeze", "unfreeze": "unfreeze",
+    "load": "load", "loadscenario": "load", "model": "model", "switchmodel": "model",
+}  # fmt: skip
+"""Orders that are understood, by their name in small letters."""
+
+
+@dataclass(frozen=True)
+class Order:
+    """What a peer wants done.
+
+    Parameters
+    ----------
+    name : str
+        One of the values of `NAMES`.
+    argument : str
+        Name of a model, file of a scenario; empty otherwise.
+    """
+
+    name: str
+    argument: str = ""
+
+
+def order_of(message: Message) -> Order | None:
+    """Order in a STRING or COMMAND, None if it is no order but some other text.
+
+    A text is an order if it is XML ``<Command Name="..." .../>``, if its device says so (``CMD_...``, ``Command``),
+    or if it comes as COMMAND.
+
+    Raises
+    ------
+    InputError
+        If it is an order that cannot be understood.
+    """
+    content = message.content
+    if isinstance(content, CommandReply):
+        return None
+    if isinstance(content, Command):
+        return (
+            _from_xml(content.text)
+            if content.text.lstrip().startswith("<")
+            else _named(content.name, content.text)
+        )
+    if isinstance(content, String):
+        text = content.text.strip()
+        if text.startswith("<Command") and not text.startswith("<CommandReply"):
+            return _from_xml(text)
+        if message.device.startswith("CMD_") or message.device.lower() == "command":
+            name, _, argument = text.partition(" ")
+            return _named(name, argument)
+    return None
+
+
+def _from_xml(text: str) -> Order:
+    if len(text) > LONGEST or "<!" in text:
+        raise InputError(
+            f"an order is XML of at most {LONGEST} characters without declarations; got {len(text)}"
+        )
+    try:
+        element = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise InputError(f"an order is <Command Name=.../>; this is no XML: {error}") from error
+    attributes: Mapping[str, str] = {k.lower(): v for k, v in element.attrib.items()}
+    argument = attributes.get("model") or attributes.get("file") or attributes.get("value") or ""
+    return _named(attributes.get("name", ""), argument)
+
+
+def _named(name: str, argument: str) -> Order:
+    key = name.strip().lower().replace("_", "").replace(" ", "")
+    if key not in NAMES:
+        raise InputError(f"orders are {', '.join(dict.fromkeys(NAMES.values()))}; got {name[:40]!r}")
+    return Order(NAMES[key], argument.strip())
+
+
+def answer(message: Message, text: str, *, done: bool) -> Message:
+    """Tell the peer what became of its order, in the form in which it asked.
+
+    Parameters
+    ----------
+    message : Message
+        The order: STRING of device ``CMD_id`` is answered by STRING ``ACK_id``, COMMAND by RTS_COMMAND, other
+        STRING by STATUS.
+    text : str
+        What happened.
+    done : bool
+        Whether the order was carried out.
+    """
+    status = "SUCCESS" if done else "FAIL"
+    xml = f"<CommandReply Status={quoteattr(status)} Message={quoteattr(text)} />"
+    content = message.content
+    if isinstance(content, Command):
+        error = "" if done else text.encode("ascii", "replace").decode()[:100]
+        said = CommandReply(content.id, error, xml)
+        return Message(
+            said, message.device, time.time(), message.version, {"Status": status, "Message": text}
+        )
+    if message.device.startswith("CMD_"):
+        return Message(String(xml), ("ACK_" + message.device[4:])[:20], time.time(), message.version)
+    said_status = Status(text=text) if done else Status(UNKNOWN_ERROR, 0, "OrderFailed", text)
+    return Message(said_status, message.device, time.time(), message.version)
