@@ -7,6 +7,7 @@ import sys
 import typer
 
 from echospline.cli.info import info
+from echospline.cli.link import link
 from echospline.cli.live import live
 from echospline.cli.sessions import sessions
 from echospline.cli.simulate import demo, simulate
@@ -27,6 +28,7 @@ app.command()(demo)
 app.command()(info)
 app.command()(live)
 app.add_typer(sessions, name="sessions")
+app.command()(link)
 
 
 def main() -> None:
