@@ -237,6 +237,7 @@ class _Requests:
     """What was asked for since the last step: the newest of each kind."""
 
     command: Command | None = None
+    place: NeedlePose | None = None
     reset: bool = False
     frozen: bool | None = None
     model: str | None = None
@@ -328,6 +329,18 @@ class LiveEngine:
         with self._lock:
             self._requests.command = Command(entry, tip, number, sent)
 
+    def place(self, entry: tuple[float, float], tip: tuple[float, float]) -> None:
+        """Put the needle here as if it had gone straight to this pose, mm: a tracker first sees it inserted.
+
+        Raises
+        ------
+        InputError
+            If a number is not finite.
+        """
+        pose = NeedlePose(entry, tip)
+        with self._lock:
+            self._requests.place, self._requests.command = pose, Command(entry, tip)
+
     def reset(self) -> None:
         """Take the needle home and the tissue to rest; also ends a replay and a failure."""
         with self._lock:
@@ -404,6 +417,10 @@ class LiveEngine:
     def _take(self, requests: _Requests) -> None:
         if requests.command is not None and not self._replay:
             self._command = requests.command
+        if requests.place is not None:
+            self._pose, self._state = requests.place, insert_straight(self._model, requests.place)
+            if self._other is not None:
+                self._other = self._other[0], insert_straight(self._other[0], requests.place)
         if requests.frozen is not None:
             self._frozen = requests.frozen
         if requests.watch is not None:

@@ -35,6 +35,9 @@ from echospline.openigtlink.tracking import Located, Tracking
 
 log = logging.getLogger("echospline.openigtlink")
 
+ARRIVES = 1.0
+"""mm; a needle first seen deeper than this is put there rather than thrust there."""
+
 
 @dataclass(frozen=True)
 class Stage:
@@ -130,7 +133,8 @@ class Session:
     load : callable, optional
         Makes a stage of the name that a LoadScenario order gives; without it such orders are refused.
     moved : callable, optional
-        Called with (entry, tip) whenever the tracker moves the needle (a page beside it follows).
+        Called with the pose whenever the tracker moves the needle, and whether it has just come into sight (a page
+        beside it follows).
     """
 
     def __init__(
@@ -138,7 +142,7 @@ class Session:
         stage: Stage,
         options: SessionOptions | None = None,
         load: Callable[[str], Stage] | None = None,
-        moved: Callable[[NeedlePose], None] | None = None,
+        moved: Callable[[NeedlePose, bool], None] | None = None,
     ) -> None:
         self.options = options or SessionOptions()
         self.port = 0
@@ -150,6 +154,7 @@ class Session:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._following = False
         self._followed = 0.0
+        self._away = True
         self._stage, self._pacer = stage, Pacer(stage.engine)
         self._tracking = Tracking(stage.image.grid, self.options.looks.naming)
         self._located = self._tracking.locate()
@@ -289,10 +294,13 @@ class Session:
         needle = self._located.needle
         if needle is None:
             return
-        pose = needle.pose(self._stage.image.grid, self.options.reach) or self._stage.engine.home
-        self._stage.engine.command(pose.entry, pose.tip)
+        engine, pose = self._stage.engine, needle.pose(self._stage.image.grid, self.options.reach)
+        # A needle that comes into sight already inserted was not thrust there in this instant.
+        appears, self._away = self._away and pose is not None and pose.depth > ARRIVES, pose is None
+        pose = pose or engine.home
+        (engine.place if appears else engine.command)(pose.entry, pose.tip)
         if self._moved is not None:
-            self._moved(pose)
+            self._moved(pose, appears)
 
     def _carry_out(self, peer: Peer, message: Message, order: Order) -> None:
         log.info("%s orders: %s %s", peer.name, order.name, order.argument)
@@ -346,7 +354,7 @@ class Session:
         old, self._pacer = self._pacer, Pacer(stage.engine)
         self._tracking = Tracking(stage.image.grid, self.options.looks.naming)
         self._located = replace(self._tracking.locate(), needle=None)
-        self._stage = stage
+        self._stage, self._away = stage, True
         self._pacer.start()
         await asyncio.to_thread(old.stop)
         peer.answer(answer(message, f"{name} is loaded", done=True))
