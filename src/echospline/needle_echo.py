@@ -9,9 +9,11 @@ further down the beam; and little sound passes, so what lies behind is darker.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import isfinite
+from math import acos, degrees, exp, hypot, isfinite, sin
+from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike
 
 from echospline.errors import InputError
@@ -120,54 +122,11 @@ def needle_echo(points: ArrayLike, pose: NeedlePose, echo: NeedleEcho) -> tuple[
     transmission : ndarray, shape (n,)
         1 where nothing shades, less behind the shaft.
     """
-    p = np.asarray(points, dtype=np.float64)
-    length, axis = pose.depth, np.asarray(pose.axis)
-    if length < ZERO_LENGTH:
-        return np.zeros(len(p)), np.ones(len(p))
-    radius, width = echo.diameter / 2, echo.resolution
-    arrival = min(
-        1.0, length / echo.diameter
-    )  # the echo grows with the first millimetre: the picture never jumps
-    beam = _beam(p, echo.apex)
-    across = np.array([-axis[1], axis[0]])
-    side = np.where(beam @ across < 0, -1.0, 1.0)  # distances across the shaft count away from the probe
-    facing = side * (beam @ across)  # sine of the angle between shaft and beam
-    along_beam = beam @ axis
-    s = (p - pose.entry) @ axis
-    d = side * ((p - pose.entry) @ across)
-
-    brightness = np.zeros(len(p))
-    spacing = max(echo.diameter, 3 * width)
-    reach = 3 * (width + radius)
-    deepest = reach + ((COPIES + 1) * spacing if echo.reverberation else 0.0)
-    near = (d > -reach) & (d < deepest) & (s > -deepest) & (s < length + deepest)
-    if near.any():
-        sn, dn, face, drop = s[near], d[near], facing[near], along_beam[near]
-        tilt = np.degrees(np.arccos(np.minimum(face, 1.0)))
-        mirror = np.exp(-((tilt / echo.fade_angle) ** 2))
-        strength = echo.floor + (1 - echo.floor) * mirror
-        light = np.zeros(len(sn))
-        if echo.shaft:
-            light += strength * _grain(length - sn) * _line(sn, dn, length, radius, width)
-        if echo.reverberation:
-            for k in range(1, COPIES + 1):
-                shift = (k + 1) * spacing  # the far wall is the first of the series
-                copy = np.exp(-(((dn + radius - shift * face) / width) ** 2))
-                copy *= _ends(sn - shift * drop, length, width)
-                light += 0.8 * COPY_LOSS**k * strength * mirror * copy
-        if echo.tip:
-            r2 = (sn - length) ** 2 + dn**2
-            light = np.maximum(light, (0.85 + 0.15 * mirror) * np.exp(-r2 / (width + 0.7 * radius) ** 2))
-        brightness[near] = arrival * echo.brightness * np.minimum(light, 1.0)
-
-    transmission = np.ones(len(p))
-    if echo.shadow:
-        behind = np.maximum(d, 0.0) / np.maximum(facing, 1e-6)  # way back along the beam to the shaft
-        met = s - behind * along_beam
-        edge = width + 0.04 * behind  # the shadow's ends blur with distance
-        inside = _step(met / edge) * _step((length - met) / edge)
-        onset = np.clip(d / (2 * radius), 0.0, 1.0) * np.exp(-behind / echo.refill)
-        transmission = 1.0 - arrival * echo.opacity * facing * onset * inside
+    p = np.ascontiguousarray(points, dtype=np.float64)
+    brightness, transmission = np.zeros(len(p)), np.ones(len(p))
+    if pose.depth < ZERO_LENGTH:
+        return brightness, transmission
+    _echo(p, pose.entry, pose.axis, pose.depth, _looks(echo), brightness, transmission)
     return brightness, transmission
 
 
@@ -214,41 +173,99 @@ def draw_needle(
     return UltrasoundImage(out, image.grid, image.source)
 
 
-def _beam(p: Floats, apex: tuple[float, float] | None) -> Floats:
-    """Direction of the sound at each point, shape (n, 2)."""
-    if apex is None:
-        return np.tile([0.0, 1.0], (len(p), 1))
-    ray = p - np.asarray(apex)
-    unit: Floats = ray / np.maximum(np.hypot(*ray.T), ZERO_LENGTH)[:, None]
-    return unit
+def _looks(echo: NeedleEcho) -> tuple[float, ...]:
+    """Return the numbers that the compiled loop takes."""
+    apex = (0.0, 0.0) if echo.apex is None else echo.apex
+    traits = (echo.shaft, echo.tip, echo.reverberation, echo.shadow, echo.apex is not None)
+    return (
+        *(float(t) for t in traits),
+        *(float(c) for c in apex),
+        echo.diameter,
+        float(echo.resolution),
+        float(echo.brightness),
+        float(echo.fade_angle),
+        float(echo.floor),
+        float(echo.opacity),
+        float(echo.refill),
+    )
 
 
-def _line(s: Floats, d: Floats, length: float, radius: float, width: float) -> Floats:
-    """Echo of the tube's two walls, and a little from between, at (s along, d across) mm."""
-    walls = np.exp(-(((d + radius) / width) ** 2)) + FAR_WALL * np.exp(-(((d - radius) / width) ** 2))
-    between = 0.45 * np.exp(-((d / (radius + width)) ** 2))
-    line: Floats = np.minimum(walls + between, 1.0) * _ends(s, length, width)
-    return line
-
-
-def _ends(s: Floats, length: float, width: float) -> Floats:
+@njit(cache=True, nogil=True)
+def _ends(s: Any, length: Any, width: Any) -> Any:
     """Fall off beyond entry and tip."""
-    beyond = np.maximum(np.maximum(-s, s - length), 0.0)
-    ends: Floats = np.exp(-((beyond / width) ** 2))
-    return ends
+    beyond = max(-s, s - length, 0.0)
+    return exp(-((beyond / width) ** 2))
 
 
-def _grain(u: Floats) -> Floats:
-    """Uneven brightness along the shaft, fixed to the needle (u mm from its tip)."""
-    grain: Floats = 0.88 + 0.12 * np.sin(2.1 * u) * np.sin(0.73 * u + 1.0)
-    return grain
-
-
-def _step(x: Floats) -> Floats:
+@njit(cache=True, nogil=True)
+def _step(x: Any) -> Any:
     """Smooth rise from 0 at x = -1 to 1 at x = 1."""
-    t = np.clip(0.5 * (x + 1.0), 0.0, 1.0)
-    step: Floats = t * t * (3.0 - 2.0 * t)
-    return step
+    t = min(max(0.5 * (x + 1.0), 0.0), 1.0)
+    return t * t * (3.0 - 2.0 * t)
+
+
+@njit(cache=True, nogil=True)
+def _light(s: Any, d: Any, facing: Any, drop: Any, length: Any, looks: Any) -> Any:
+    """Echo at (s along, d across) mm: the tube's two walls, their copies further down the beam, the tip."""
+    shaft, tip, reverberation = looks[0], looks[1], looks[2]
+    radius, width, fade, floor = looks[7] / 2, looks[8], looks[10], looks[11]
+    tilt = degrees(acos(min(facing, 1.0)))
+    mirror = exp(-((tilt / fade) ** 2))
+    strength = floor + (1 - floor) * mirror
+    light = 0.0
+    if shaft:
+        u = length - s  # uneven brightness, fixed to the needle
+        grain = 0.88 + 0.12 * sin(2.1 * u) * sin(0.73 * u + 1.0)
+        walls = exp(-(((d + radius) / width) ** 2)) + FAR_WALL * exp(-(((d - radius) / width) ** 2))
+        between = 0.45 * exp(-((d / (radius + width)) ** 2))
+        light += strength * grain * min(walls + between, 1.0) * _ends(s, length, width)
+    if reverberation:
+        spacing = max(2 * radius, 3 * width)
+        for k in range(1, COPIES + 1):
+            shift = (k + 1) * spacing  # the far wall is the first of the series
+            copy = exp(-(((d + radius - shift * facing) / width) ** 2)) * _ends(
+                s - shift * drop, length, width
+            )
+            light += 0.8 * COPY_LOSS**k * strength * mirror * copy
+    if tip:
+        r2 = (s - length) ** 2 + d * d
+        light = max(light, (0.85 + 0.15 * mirror) * exp(-r2 / (width + 0.7 * radius) ** 2))
+    return light
+
+
+@njit(cache=True, nogil=True)
+def _echo(
+    points: Any, entry: Any, axis: Any, length: Any, looks: Any, brightness: Any, transmission: Any
+) -> None:
+    """Fill brightness and transmission point by point."""
+    reverberation, shadow, curved = looks[2], looks[3], looks[4]
+    diameter, width, refill = looks[7], looks[8], looks[13]
+    arrival = min(1.0, length / diameter)  # the echo grows with the first millimetre: the picture never jumps
+    reach = 3 * (width + diameter / 2)
+    deepest = reach + ((COPIES + 1) * max(diameter, 3 * width) if reverberation else 0.0)
+    beam_x, beam_y = 0.0, 1.0
+    for i in range(len(points)):
+        x, y = points[i, 0], points[i, 1]
+        if curved:
+            beam_x, beam_y = x - looks[5], y - looks[6]
+            size = max(hypot(beam_x, beam_y), ZERO_LENGTH)
+            beam_x, beam_y = beam_x / size, beam_y / size
+        across = beam_y * axis[0] - beam_x * axis[1]
+        side = -1.0 if across < 0 else 1.0  # distances across the shaft count away from the probe
+        facing = side * across  # sine of the angle between shaft and beam
+        drop = beam_x * axis[0] + beam_y * axis[1]
+        s = (x - entry[0]) * axis[0] + (y - entry[1]) * axis[1]
+        d = side * ((y - entry[1]) * axis[0] - (x - entry[0]) * axis[1])
+        if -reach < d < deepest and -deepest < s < length + deepest:
+            brightness[i] = arrival * looks[9] * min(_light(s, d, facing, drop, length, looks), 1.0)
+        if shadow and d > 0:
+            behind = d / max(facing, 1e-6)  # way back along the beam to the shaft
+            met = s - behind * drop
+            edge = width + 0.04 * behind  # the shadow's ends blur with distance
+            inside = _step(met / edge) * _step((length - met) / edge)
+            if inside > 0:
+                onset = min(d / diameter, 1.0) * exp(-behind / refill)
+                transmission[i] = 1.0 - arrival * looks[12] * facing * onset * inside
 
 
 def _touched(image: UltrasoundImage, pose: NeedlePose, echo: NeedleEcho) -> tuple[slice, slice]:
