@@ -11,6 +11,7 @@ from echospline.errors import InputError
 from echospline.grid import RegularGrid
 from echospline.phantom import Inclusion, Layer, Phantom, Scatterers, deposit
 from echospline.probe import CONVEX, LINEAR, Probe
+from echospline.speckle import speckle_statistics
 
 GRID = RegularGrid((200, 200), (0.1, 0.1))
 QUIET = replace(LINEAR, snr=float("inf"))
@@ -160,11 +161,25 @@ def test_picture_on_a_foreign_grid_is_refused():
 
 def test_deposit_keeps_the_sum_and_the_first_moment():
     rng = np.random.default_rng(2)
-    points, values = rng.uniform(0.5, 8.5, (500, 2)), rng.standard_normal(500) + 0j
+    points, values = rng.uniform(0.5, 8.5, (500, 2)), rng.standard_normal(500)
     grid = RegularGrid((10, 10), (1.0, 1.0))
     out = deposit(points, values, grid)
     assert out.sum() == pytest.approx(values.sum(), rel=1e-5)
     assert out.ravel() @ grid.nodes == pytest.approx(values @ points, rel=1e-4)
+    turned = deposit(points, values, grid, (0.3, 0.7))
+    assert turned.sum() == pytest.approx((values * np.exp(-2j * np.pi * points @ [0.3, 0.7])).sum(), rel=1e-4)
+    assert not deposit(np.array([[-0.1, 3.0], [9.5, 3.0], [3.0, np.nan]]), np.ones(3), grid).any()
+
+
+def test_compounding_brings_the_envelope_closer_to_its_mean():
+    # n independent looks divide the variance of the envelope by n; +-12 degrees are independent here
+    phantom = Phantom(QUIET, GRID, seed=3)
+    looks = [phantom.form(steering=angle).envelope() for angle in (-12.0, 0.0, 12.0)]
+    one, three = (
+        speckle_statistics(e, phantom.samples.spacing).snr for e in (looks[1], np.mean(looks, axis=0))
+    )
+    assert one == pytest.approx(1.913, rel=0.08)
+    assert three / one == pytest.approx(np.sqrt(3.0), rel=0.08)
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,7 @@ class DenseFlow:
     patch: int = 16
     stride: int = 8
     iterations: int = 12
-    refinements: int = 10
+    refinements: int = 8
     smoothness: float = 40.0
     finest: int = 0
 

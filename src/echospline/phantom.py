@@ -9,11 +9,13 @@ complex baseband, where the field is smooth, and convolves by Fourier transform;
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import isfinite, pi
+from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy import fft
 
@@ -149,6 +151,8 @@ class Phantom:
     regions: tuple[Inclusion | Layer, ...] = ()
     reserve: float = 2.0
     """Tissue beyond the picture, mm, that may move into it."""
+    echogenicity: Callable[[Floats], Floats] | None = None
+    """Level in dB at points (n, 2) mm, on top of the regions."""
     scatterers: Scatterers = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -158,13 +162,13 @@ class Phantom:
             raise InputError(f"reserve must be zero or a positive length in mm; got {self.reserve}")
         x0, x1, y0, y1 = self.lattice.extent
         r = self.reserve
-        object.__setattr__(
-            self,
-            "scatterers",
-            Scatterers.random(
-                (x0 - r, x1 + r, y0 - r, y1 + r), self.per_cell / self.probe.cell, self.seed, self.regions
-            ),
+        scatterers = Scatterers.random(
+            (x0 - r, x1 + r, y0 - r, y1 + r), self.per_cell / self.probe.cell, self.seed, self.regions
         )
+        if self.echogenicity is not None:
+            level = np.asarray(self.echogenicity(scatterers.positions), dtype=np.float64)
+            scatterers = replace(scatterers, amplitudes=scatterers.amplitudes * 10.0 ** (level / 20.0))
+        object.__setattr__(self, "scatterers", scatterers)
 
     @cached_property
     def samples(self) -> RegularGrid:
@@ -203,6 +207,7 @@ class Phantom:
         displacement: Displacement | None = None,
         noise_seed: int | None = None,
         replaced: float = 0.0,
+        steering: float = 0.0,
     ) -> Echo:
         """Image the moved scatterers by convolution.
 
@@ -214,6 +219,9 @@ class Phantom:
             Seed of this frame's noise (and of the replaced scatterers); no noise when not given.
         replaced : float
             Share of the scatterers that has left the imaging plane since the reference.
+        steering : float
+            Angle of the beams in degrees: turns the carrier, not the envelope of the point spread. Envelopes of
+            several angles have different speckle; their mean is a compounded picture.
 
         Returns
         -------
@@ -224,8 +232,8 @@ class Phantom:
             self.scatterers.replaced(replaced, (noise_seed or 0) + 1) if replaced else self.scatterers
         )
         p, lattice = self.moved(displacement), self.lattice
-        phase = (2.0 * pi * self.probe.carrier * p[:, 1]) % (2.0 * pi)
-        field_ = deposit(p, scatterers.amplitudes * np.exp(-1j * phase), lattice)
+        k, theta = self.probe.carrier, np.radians(steering)
+        spread = deposit(p, scatterers.amplitudes, lattice, (k * np.sin(theta), k * np.cos(theta)))
         kx = fourier_frequencies(lattice.shape[0], lattice.spacing[0])
         ky = fourier_frequencies(lattice.shape[1], lattice.spacing[1])
         # the hat function of the deposit multiplies the spectrum by sinc^2; dividing it out leaves only its aliases
@@ -233,7 +241,7 @@ class Phantom:
         lateral = np.exp(-2.0 * (pi * beam * kx) ** 2) / np.sinc(kx * lattice.spacing[0]) ** 2
         axial = np.exp(-2.0 * (pi * self.probe.sigma_axial * ky) ** 2) / np.sinc(ky * lattice.spacing[1]) ** 2
         blurred = fft.ifft(
-            fft.fft(field_, axis=1, workers=-1) * lateral.astype(np.float32), axis=1, workers=-1
+            fft.fft(spread, axis=1, workers=-1) * lateral.astype(np.float32), axis=1, workers=-1
         )
         blurred = fft.ifft(
             fft.fft(blurred, axis=0, workers=-1) * axial.astype(np.float32)[:, None], axis=0, workers=-1
@@ -281,27 +289,54 @@ class Phantom:
         return gain
 
 
-def deposit(points: Floats, values: Complexes, grid: RegularGrid) -> Complexes:
-    """Share complex values among the four grid points around each point (bilinear), shape (ny, nx).
+def deposit(
+    points: Floats, amplitudes: Floats, grid: RegularGrid, wave: tuple[float, float] = (0.0, 0.0)
+) -> Complexes:
+    """Share amplitudes times exp(-2 pi i wave . p) among the four grid points around each point p (bilinear).
 
-    Points outside the grid fall away.
+    Parameters
+    ----------
+    points : ndarray, shape (n, 2)
+        mm; those outside the grid fall away.
+    amplitudes : ndarray, shape (n,)
+    grid : RegularGrid
+    wave : (float, float)
+        Cycles per mm along (x, y).
+
+    Returns
+    -------
+    ndarray, shape (ny, nx), complex64
     """
-    nx, ny = grid.shape
-    at = grid.to_index(points)
-    cell = np.floor(at).astype(np.int64)
-    ok = (cell >= 0).all(axis=1) & (cell[:, 0] < nx - 1) & (cell[:, 1] < ny - 1)
-    fx, fy = (at[ok] - cell[ok]).T
-    base, v = cell[ok, 1] * nx + cell[ok, 0], values[ok]
-    total = np.zeros(nx * ny, dtype=np.complex128)
-    for shift, w in (
-        (0, (1 - fx) * (1 - fy)),
-        (1, fx * (1 - fy)),
-        (nx, (1 - fx) * fy),
-        (nx + 1, fx * fy),
-    ):
-        total.real += np.bincount(base + shift, w * v.real, minlength=nx * ny)
-        total.imag += np.bincount(base + shift, w * v.imag, minlength=nx * ny)
-    return total.reshape(ny, nx).astype(np.complex64)
+    out = np.zeros(grid.shape[::-1], dtype=np.complex64)
+    _deposit(
+        np.ascontiguousarray(points),
+        np.ascontiguousarray(amplitudes),
+        np.asarray(grid.origin),
+        np.asarray(grid.spacing),
+        np.asarray(wave),
+        out,
+    )
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _deposit(points: Any, amplitudes: Any, origin: Any, spacing: Any, wave: Any, out: Any) -> None:
+    ny, nx = out.shape
+    for i in range(len(points)):
+        x, y = points[i, 0], points[i, 1]
+        gx, gy = (x - origin[0]) / spacing[0], (y - origin[1]) / spacing[1]
+        if not (gx >= 0.0 and gy >= 0.0 and gx < nx - 1 and gy < ny - 1):
+            continue
+        ix, iy = int(gx), int(gy)
+        fx, fy = gx - ix, gy - iy
+        # whole turns go first: the cosine of a small angle is the faster one
+        turns = wave[0] * x + wave[1] * y
+        angle = 2.0 * pi * (turns - np.floor(turns))
+        re, im = amplitudes[i] * np.cos(angle), -amplitudes[i] * np.sin(angle)
+        out[iy, ix] += (1 - fx) * (1 - fy) * complex(re, im)
+        out[iy, ix + 1] += fx * (1 - fy) * complex(re, im)
+        out[iy + 1, ix] += (1 - fx) * fy * complex(re, im)
+        out[iy + 1, ix + 1] += fx * fy * complex(re, im)
 
 
 def _inside(small: RegularGrid, large: RegularGrid) -> tuple[slice, slice]:
