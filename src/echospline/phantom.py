@@ -102,7 +102,8 @@ class Scatterers:
             )
         rng = np.random.default_rng(seed)
         positions = rng.uniform((x0, y0), (x1, y1), (n, 2))
-        amplitudes = rng.standard_normal(n)
+        # equal strengths: at the same number per cell their speckle is more developed than that of random ones
+        amplitudes = rng.choice((-1.0, 1.0), n)
         level = np.zeros(n)
         for region in regions:
             level[region.contains(positions)] = region.level

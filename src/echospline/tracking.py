@@ -262,7 +262,7 @@ def grey_pair(before: Frame, after: Frame) -> tuple[Grey, Grey, RegularGrid]:
         raise InputError(f"both frames of a pair must have one grid; got {before.grid} and {after.grid}")
     a, b = (np.asarray(f.pixels) for f in (before, after))
     if a.ndim == 3:
-        a, b = (np.asarray(f.mean(axis=2)) for f in (a, b))
+        a, b = (np.asarray(np.rint(f.mean(axis=2)), dtype=f.dtype) for f in (a, b))
     if a.dtype != np.uint8 or b.dtype != np.uint8:
         low, high = min(a.min(), b.min()), max(a.max(), b.max())
         scale = 255.0 / (high - low) if high > low else 0.0
