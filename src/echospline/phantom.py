@@ -229,10 +229,16 @@ class Phantom:
         Echo
             Mean power 1 for speckle of 0 dB.
         """
+        return self.formed_at(self.moved(displacement), noise_seed, replaced, steering)
+
+    def formed_at(
+        self, positions: Floats, noise_seed: int | None = None, replaced: float = 0.0, steering: float = 0.0
+    ) -> Echo:
+        """As `form`, with the scatterers at given positions (n, 2) mm: several looks share one motion."""
         scatterers = (
             self.scatterers.replaced(replaced, (noise_seed or 0) + 1) if replaced else self.scatterers
         )
-        p, lattice = self.moved(displacement), self.lattice
+        p, lattice = positions, self.lattice
         k, theta = self.probe.carrier, np.radians(steering)
         spread = deposit(p, scatterers.amplitudes, lattice, (k * np.sin(theta), k * np.cos(theta)))
         kx = fourier_frequencies(lattice.shape[0], lattice.spacing[0])
