@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from io import BytesIO
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pydicom
@@ -12,7 +11,7 @@ import pytest
 from PIL import Image
 from pydicom.data import get_testdata_file
 from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
-from pydicom.encaps import generate_frames
+from pydicom.encaps import encapsulate, generate_frames
 from pydicom.uid import ExplicitVRLittleEndian, UltrasoundMultiFrameImageStorage
 
 from echospline.errors import InputError, MissingExtraError
@@ -165,12 +164,14 @@ def test_every_transfer_syntax_that_needs_no_extra_is_read(name: str, shape: tup
     assert image.pixels.std() > 1
 
 
+KILLS = [(4743, 145), (4967, 179), (4028, 74), (1631, 224), (5010, 95), (1353, 202)]
+"""Bytes of the first lossless file, and values that make GDCM 3.2 abort its process."""
 LOSSLESS = ["SC_rgb_jpeg_gdcm.dcm", "MR_small_jpeg_ls_lossless.dcm"]
 
 
 @pytest.mark.parametrize("name", LOSSLESS)
 def test_a_compression_that_needs_the_extra_says_which(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("echospline.io.dicom.get_decoder", lambda syntax: SimpleNamespace(is_available=False))
+    monkeypatch.setattr("echospline.io.dicom.find_spec", lambda name: None)
     with pytest.raises(MissingExtraError, match=r"pip install 'echospline\[dicom\]'"):
         read(get_testdata_file(name), spacing=(0.1, 0.1))
 
@@ -180,6 +181,28 @@ def test_lossless_jpeg_equals_the_picture_without_it(name: str, same: str) -> No
     pytest.importorskip("gdcm", reason="the extra dicom is not installed")
     image = read(get_testdata_file(name), colour=True)
     np.testing.assert_array_equal(image.pixels, pydicom.dcmread(get_testdata_file(same)).pixel_array)
+
+
+def test_lossless_frames_are_read_one_by_one_or_all(tmp_path: Path) -> None:
+    pytest.importorskip("gdcm", reason="the extra dicom is not installed")
+    data = pydicom.dcmread(get_testdata_file(LOSSLESS[1]))
+    frame = next(generate_frames(data.PixelData, number_of_frames=1))
+    data.PixelData, data.NumberOfFrames = encapsulate([frame, frame]), 2
+    data.save_as(tmp_path / "a.dcm")
+    cine = read(tmp_path / "a.dcm", fps=10)
+    assert cine.frames.shape == (2, 64, 64)
+    np.testing.assert_array_equal(cine.frames[0], cine.frames[1])
+    np.testing.assert_array_equal(read(tmp_path / "a.dcm", frame=1).pixels, cine.frames[0])
+
+
+def test_a_frame_that_kills_the_lossless_decoder_is_one_damaged_file(tmp_path: Path) -> None:
+    pytest.importorskip("gdcm", reason="the extra dicom is not installed")
+    content = bytearray(Path(get_testdata_file(LOSSLESS[0])).read_bytes())
+    for where, value in KILLS:
+        content[where] = value
+    (tmp_path / "a.dcm").write_bytes(content)
+    with pytest.raises(InputError, match="cannot be decoded"):
+        read(tmp_path / "a.dcm")
 
 
 def test_twelve_bit_jpeg_has_no_decoder_and_is_not_called_damaged() -> None:

@@ -96,7 +96,7 @@ def test_the_whole_file_is_read(tmp_path: Path, kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", SAMPLES)
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_changed_bytes_give_one_sentence_or_a_picture(tmp_path: Path, kind: str, data: st.DataObject) -> None:
     content = bytearray(SAMPLES[kind])

@@ -9,13 +9,15 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from matplotlib.collections import LineCollection
+from matplotlib.quiver import Quiver
 from PIL import Image
 
 from echospline.data import sample_image
 from echospline.errors import InputError
 from echospline.grid import RegularGrid
 from echospline.needle import NeedlePose
-from echospline.plot import summary_figure
+from echospline.plot import draw_summary, summary_figure
 
 IMAGE = sample_image()
 MESH = RegularGrid.covering(IMAGE.grid, (40, 30))
@@ -59,6 +61,29 @@ def test_the_displaced_place_is_the_bright_one(drawn: Path, tmp_path: Path) -> N
             int((np.asarray(p.convert("RGB")).astype(int) @ [1, 0, -1] > 90).sum()) for p in (a, b)
         )
     assert moved > still + 2000
+
+
+def test_everything_is_drawn_where_it_is_in_millimetres() -> None:
+    figure = draw_summary(IMAGE, IMAGE, MESH, push(MESH), POSE)
+    rest, deformed, field = figure.axes[:3]
+    assert rest.images[0].get_extent() == pytest.approx(
+        [-0.0433, 49.8383, 39.4463, -0.0433]
+    )  # half a pixel around
+    assert rest.yaxis_inverted()  # depth grows downwards
+    nodes = (MESH.nodes + push(MESH)).reshape(30, 40, 2)
+    (lines,) = (c for c in deformed.collections if isinstance(c, LineCollection))
+    segments = lines.get_segments()
+    assert len(segments) == 70
+    np.testing.assert_allclose(segments[11], nodes[11])
+    np.testing.assert_allclose(segments[30 + 7], nodes[:, 7])
+    (arrows,) = (c for c in field.collections if isinstance(c, Quiver))
+    starts = np.column_stack([arrows.X, arrows.Y])
+    node = np.linalg.norm(MESH.nodes[None] - starts[:, None], axis=2).argmin(axis=1)
+    np.testing.assert_allclose(starts, MESH.nodes[node], atol=1e-9)
+    np.testing.assert_allclose(np.column_stack([arrows.U, arrows.V]), push(MESH)[node])
+    for axes in (deformed, field):
+        shaft = np.column_stack(axes.lines[0].get_data())
+        np.testing.assert_allclose(shaft, [POSE.entry, POSE.tip])
 
 
 def test_a_mesh_of_one_node_per_pixel_can_be_drawn(tmp_path: Path) -> None:

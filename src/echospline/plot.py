@@ -39,7 +39,33 @@ def summary_figure(
     *,
     title: str = "",
 ) -> None:
-    """Draw one run: the image at rest, the last image with the deformed mesh, and the displacement.
+    """Draw one run into a file: `draw_summary`, then `save`.
+
+    Parameters
+    ----------
+    first, last, mesh, displacement, pose, title
+        As for `draw_summary`.
+    path : str or Path
+        ``.png``, ``.svg`` or ``.pdf``.
+
+    Raises
+    ------
+    InputError
+        If something does not fit, the suffix is another, or the file cannot be written.
+    """
+    save(draw_summary(first, last, mesh, displacement, pose, title=title), path)
+
+
+def draw_summary(
+    first: UltrasoundImage,
+    last: UltrasoundImage,
+    mesh: RegularGrid,
+    displacement: Floats,
+    pose: NeedlePose,
+    *,
+    title: str = "",
+) -> Figure:
+    """Draw the image at rest, the last image with the deformed mesh, and the displacement, side by side in mm.
 
     Parameters
     ----------
@@ -51,15 +77,18 @@ def summary_figure(
         Of the nodes in the last frame, mm.
     pose : NeedlePose
         The needle in the last frame.
-    path : str or Path
-        ``.png``, ``.svg`` or ``.pdf``.
     title : str
         One line above all.
+
+    Returns
+    -------
+    Figure
+        Needs no display.
 
     Raises
     ------
     InputError
-        If the displacement does not fit the mesh, the images differ in grid, or the suffix is another.
+        If the displacement does not fit the mesh or the images differ in grid.
     """
     displacement = np.asarray(displacement, dtype=np.float64)
     if displacement.shape != (mesh.size, 2) or not np.isfinite(displacement).all():
@@ -85,7 +114,7 @@ def summary_figure(
     rest.set_ylabel("depth, mm")
     rest.set_xlim(left, right)
     rest.set_ylim(bottom, top)
-    save(figure, path)
+    return figure
 
 
 def save(figure: Figure, path: str | Path, *, dpi: int = 130) -> None:

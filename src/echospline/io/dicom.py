@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from importlib.util import find_spec
 from math import ceil, isfinite
 from pathlib import Path
 from typing import Any
@@ -14,20 +15,35 @@ from typing import Any
 import numpy as np
 import pydicom
 from pydicom.encaps import get_frame
-from pydicom.pixels.decoders.base import get_decoder
 from pydicom.pixels.processing import apply_color_lut
 from pydicom.pixels.utils import iter_pixels
-from pydicom.uid import DeflatedExplicitVRLittleEndian, JPEGBaseline8Bit, JPEGExtended12Bit
+from pydicom.uid import (
+    JPEG2000,
+    UID,
+    DeflatedExplicitVRLittleEndian,
+    JPEG2000Lossless,
+    JPEGBaseline8Bit,
+    JPEGExtended12Bit,
+    JPEGLossless,
+    JPEGLosslessSV1,
+    JPEGLSLossless,
+    JPEGLSNearLossless,
+    RLELossless,
+)
 
 from echospline.errors import InputError, MissingExtraError
 from echospline.grid import Floats
 from echospline.image import Pixels
+from echospline.io.lossless import lossless_frames
 from echospline.io.recording import MIB, Box, Recording, Region, check_size, decoding, quietly
 
 _CENTIMETRE = 3
 """Code of cm in Physical Units X/Y Direction (0018,6024/6026)."""
 _SPATIAL = {1: "2-D", 2: "M-mode", 3: "spectral", 4: "wave form", 5: "graphics"}
 _DATA = {1: "tissue", 2: "colour flow", 3: "PW Doppler", 4: "CW Doppler", 0x0A: "ECG", 0x12: "colour bar"}
+_PILLOW = (JPEGBaseline8Bit, JPEGExtended12Bit, JPEG2000, JPEG2000Lossless)
+_GDCM = (JPEGLossless, JPEGLosslessSV1, JPEGLSLossless, JPEGLSNearLossless)
+"""Transfer syntaxes by who decodes them."""
 _MOST_SHRUNK = 8
 """How many times smaller than its own regions a picture is taken to be."""
 _DEFLATE = 1032
@@ -70,19 +86,14 @@ def open_dicom(path: Path, limit: float) -> Recording:
             raise InputError(
                 f"{path} has pixels of kind {colours}; expected MONOCHROME, RGB, YBR or PALETTE COLOR"
             )
-        dtype = _dtype(path, header, colours)
+        palette = colours.startswith("PALETTE")
+        stored_dtype = _dtype(path, header)
+        dtype = np.dtype(np.uint8) if palette else stored_dtype
         check_size(path, rows, columns, frames, channels * dtype.itemsize, limit)
         _check_decoder(path, header)
         regions, notes = _regions(header, rows, columns)
         tissue = _tissue(regions)
-        if sum(r.spacing is not None for r in regions) > 1 and tissue:
-            notes.append(f"{len(regions)} regions: {tissue.content} at {tissue.box} taken")
-        if tissue and tissue.box == (0, 0, columns, rows):
-            notes.append(
-                "its region is the whole picture, margins and text included: give a region to cut them off"
-            )
-        if header.get("Modality", "US") not in ("US", "IVUS"):
-            notes.append(f"modality {header.Modality}, not ultrasound")
+        notes += _doubts(header, regions, tissue, (0, 0, columns, rows))
         times = _times(header, frames)
         mislabelled = _mislabelled(path, header)
         if mislabelled:
@@ -92,8 +103,13 @@ def open_dicom(path: Path, limit: float) -> Recording:
         spacing = tissue.spacing if tissue else _pixel_spacing(header)
 
     def shown(frame: int | None) -> Iterator[Pixels]:
-        for raw in _raw_frames(path, syntax == DeflatedExplicitVRLittleEndian, frame, mislabelled):
-            if colours.startswith("PALETTE"):
+        shape = (rows, columns, 3) if channels == 3 and not palette else (rows, columns)
+        if syntax in _GDCM:
+            raws = lossless_frames(path, shape, stored_dtype, frame, syntax.name)
+        else:
+            raws = _raw_frames(path, syntax, frame, mislabelled)
+        for raw in raws:
+            if palette:
                 yield _coloured(raw, header)
             else:
                 yield _upright(raw, stored) if colours == "MONOCHROME1" else raw
@@ -118,11 +134,15 @@ def open_dicom(path: Path, limit: float) -> Recording:
     )  # fmt: skip
 
 
-def _raw_frames(path: Path, deflated: bool, frame: int | None, mislabelled: bool) -> Iterator[Pixels]:
-    """Frames as pydicom decodes them, read from the disk one by one (a deflated file only as a whole)."""
+def _raw_frames(path: Path, syntax: UID, frame: int | None, mislabelled: bool) -> Iterator[Pixels]:
+    """Frames as pydicom decodes them, read from the disk one by one (a deflated file only as a whole).
+
+    The decoder is named, for pydicom would prefer GDCM where that is installed (see `echospline.io.lossless`).
+    """
     options: dict[str, Any] = {"photometric_interpretation": "YBR_FULL"} if mislabelled else {}
-    source: Any = pydicom.dcmread(path) if deflated else path
-    return iter_pixels(source, indices=None if frame is None else [frame], **options)
+    source: Any = pydicom.dcmread(path) if syntax == DeflatedExplicitVRLittleEndian else path
+    plugin = "pillow" if syntax in _PILLOW else ""
+    return iter_pixels(source, indices=None if frame is None else [frame], decoding_plugin=plugin, **options)
 
 
 def _coloured(indices: Pixels, header: pydicom.Dataset) -> Pixels:
@@ -158,28 +178,24 @@ def _check_deflated(path: Path, limit: float) -> None:
 
 
 def _check_decoder(path: Path, header: pydicom.Dataset) -> None:
+    """Refuse what cannot be decoded before any pixel is wanted."""
     syntax = header.file_meta.TransferSyntaxUID
-    if not syntax.is_compressed or syntax == DeflatedExplicitVRLittleEndian:
-        return
-    try:
-        decoder = get_decoder(syntax)
-    except NotImplementedError:
-        decoder = None
-    if decoder is None or (syntax == JPEGExtended12Bit and header.get("BitsStored") != 8):
+    known = (*_PILLOW, *_GDCM, RLELossless, DeflatedExplicitVRLittleEndian)
+    if syntax.is_compressed and (
+        syntax not in known or (syntax == JPEGExtended12Bit and header.get("BitsStored") != 8)
+    ):
         raise InputError(
             f"{path} is compressed as {syntax.name} with {header.get('BitsStored')} bits, for which there is no "
             "decoder: export it uncompressed"
         )
-    if not decoder.is_available:
+    if syntax in _GDCM and find_spec("gdcm") is None:
         raise MissingExtraError("python-gdcm", "dicom", f"DICOM compressed as {syntax.name}")
 
 
-def _dtype(path: Path, header: pydicom.Dataset, colours: str) -> np.dtype[Any]:
+def _dtype(path: Path, header: pydicom.Dataset) -> np.dtype[Any]:
     bits = int(header.get("BitsAllocated", 8))
     if bits not in (8, 16, 32):
         raise InputError(f"{path} has {bits} bits per pixel; expected 8, 16 or 32")
-    if colours.startswith("PALETTE"):
-        return np.dtype(np.uint8)
     signed = int(header.get("PixelRepresentation", 0)) == 1
     return np.dtype(f"{'i' if signed else 'u'}{bits // 8}")
 
@@ -230,6 +246,21 @@ def _regions(header: pydicom.Dataset, rows: int, columns: int) -> tuple[tuple[Re
             f"its ultrasound regions reach beyond the {side} edge: the picture was cut there, spacing kept"
         )
     return tuple(r for r in (_shrunk(r, factor, rows, columns) for r in found) if r), notes
+
+
+def _doubts(
+    header: pydicom.Dataset, regions: tuple[Region, ...], tissue: Region | None, whole: Box
+) -> list[str]:
+    notes = []
+    if sum(r.spacing is not None for r in regions) > 1 and tissue:
+        notes.append(f"{len(regions)} regions: {tissue.content} at {tissue.box} taken")
+    if tissue and tissue.box == whole:
+        notes.append(
+            "its region is the whole picture, margins and text included: give a region to cut them off"
+        )
+    if header.get("Modality", "US") not in ("US", "IVUS"):
+        notes.append(f"modality {header.Modality}, not ultrasound")
+    return notes
 
 
 def _shrunk(region: Region, factor: int, rows: int, columns: int) -> Region | None:
