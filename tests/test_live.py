@@ -112,6 +112,20 @@ def test_speed_is_that_of_the_hand_whatever_the_rate_of_commands():
     assert raw.std() > 10 * settled.std()
 
 
+@pytest.mark.parametrize("every", [1, 2, 8, 20])
+def test_a_steady_push_is_steady_however_slow_the_screen(every):
+    """A hand at 10 mm/s seen at 120, 60, 15 or 6 Hz: the speed that the tissue feels stays within half of it."""
+    live, speeds = LiveEngine(models, "soft", HOME, rate=120.0), []
+    for step in range(480):
+        if step % every == 0:
+            live.command((20.0, 0.0), (20.0, 10.0 * step / 120.0))
+        speeds.append(live.step().pose.speed)
+    settled = np.array(speeds[240:])
+    assert settled.mean() == pytest.approx(10.0, rel=0.05)
+    assert settled.max() < 17.0
+    assert settled.min() > 5.0
+
+
 def test_the_needle_arrives_exactly_and_then_rests():
     live = engine()
     live.command((20.0, 0.0), (22.5, 14.25))

@@ -28,6 +28,9 @@ ModelFactory = Callable[[str], AnyModel]
 ARRIVED = 1e-4
 """mm; a needle that comes this near to where it is commanded is put exactly there."""
 
+PAUSE = 0.5
+"""s; commands further apart than this do not belong to one motion."""
+
 T = TypeVar("T")
 
 
@@ -264,7 +267,8 @@ class LiveEngine:
     rate : float
         Steps per second.
     lag : float
-        Time constant with which the needle follows its command, s.
+        Time constant with which the needle follows its command, s; longer while commands come more rarely than
+        that, or a slow screen would make a steady push a row of jolts. 0 follows at once.
     fastest : float
         Upper limit of the needle's speed, mm/s.
 
@@ -302,6 +306,7 @@ class LiveEngine:
         self._other: tuple[AnyModel, Any] | None = None
         self._pose = replace(home, speed=0.0)
         self._command = Command(home.entry, home.tip)
+        self._waited = self._interval = 0
         self._watch: Floats = np.empty((0, 2))
         self._replay: deque[NeedlePose] = deque()
         self._replaying = False
@@ -415,8 +420,12 @@ class LiveEngine:
         return snapshot
 
     def _take(self, requests: _Requests) -> None:
+        self._waited += 1
         if requests.command is not None and not self._replay:
             self._command = requests.command
+            # steps between commands; after a longer pause the next push begins afresh
+            self._interval = self._waited if self._waited * self.period < PAUSE else 1
+            self._waited = 0
         if requests.place is not None:
             self._pose, self._state = requests.place, insert_straight(self._model, requests.place)
             if self._other is not None:
@@ -456,7 +465,8 @@ class LiveEngine:
             pose = self._replay.popleft()
             self._command = replace(self._command, entry=pose.entry, tip=pose.tip)
         else:
-            pose = follow(self._pose, self._command, self.period, self._lag, self._fastest)
+            lag = max(self._lag, self._interval * self.period) if self._lag > 0 else 0.0
+            pose = follow(self._pose, self._command, self.period, lag, self._fastest)
         self._state = self._model.advance(self._state, pose, self.period)
         if self._other is not None:
             model, state = self._other

@@ -24,7 +24,7 @@ from echospline.viewer.scene import Scene
 from echospline.viewer.server import Settings, build_app, serve
 from echospline.viewer.sessions import Sessions
 
-LABELS = {"tps": "Thin plate", "elastic": "Elastic", "green": "Green", "fem": "FEM"}
+LABELS = {"tps": "TPS", "elastic": "Elastic", "green": "Green", "fem": "FEM"}
 
 
 def default_sessions() -> Path:

@@ -73,12 +73,22 @@ export class Link {
     socket.onclose = (event) => {
       if (this.socket !== socket) return;
       if (event.code === 4404) this.useScene("");
-      const refused = event.code === 1008 || (!opened && this.token !== "");
-      this.onState(refused ? "refused" : "lost", event.reason);
+      this.onState(event.code === 1008 ? "refused" : "lost", event.reason);
       if (event.code === 1008) return;
+      if (!opened) this.askWhy();
       setTimeout(() => this.socket === socket && this.connect(), this.wait);
       this.wait = Math.min(2 * this.wait, LONGEST_WAIT);
     };
+  }
+
+  /** A socket that was never opened gives no reason; a plain request does. */
+  async askWhy() {
+    try {
+      const answer = await fetch("/api/sessions", { headers: this.token ? { Authorization: `Bearer ${this.token}` } : {} });
+      if (answer.status === 401) this.onState("refused", await answer.text());
+    } catch {
+      // the server is not there: that was said already
+    }
   }
 
   /** @returns {Frame | null} the newest frame, once */

@@ -8,7 +8,7 @@ import { FRAGMENT, VERTEX } from "./shaders.js";
 
 const BACKGROUND = [0.031, 0.039, 0.047];
 const LANDMARK_ROW = 256; // texels a row of the landmarks' texture
-const MOST_NODES_A_SIDE = 160; // of the mesh that a spline is evaluated on
+const MOST_NODES_A_SIDE = 72; // of the mesh that a spline is evaluated on
 /** Viridis, nine anchors. */
 export const COLOURS = ["440154", "472d7b", "3b528b", "2c728e", "21918c", "28ae80", "5ec962", "addc30", "fde725"];
 
