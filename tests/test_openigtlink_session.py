@@ -455,11 +455,11 @@ def test_the_command_runs_and_refuses_in_words() -> None:
     assert "OpenIGTLink on 127.0.0.1:" in good.output
     for arguments, reason in [
         (["--orientation", "FM"], "MF, UF, MN, UN"),
-        (["--axis", "q"], "x, -x"),
+        (["--needle-axis", "q"], "x, -x"),
         (["--connect", "host:port"], "HOST:PORT"),
         (["--no-serve"], "nothing to do"),
-        (["--target", "1"], "two numbers"),
-        (["--fps", "0"], "above 0"),
+        (["--target", "1"], "X,Y in mm"),
+        (["--fps", "0"], "--fps"),
     ]:
         bad = runner.invoke(app, ["link", "--port", "0", "--duration", "0.1", *arguments])
         assert isinstance(bad.exception, InputError)
