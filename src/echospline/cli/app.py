@@ -6,11 +6,13 @@ import sys
 
 import typer
 
+from echospline.cli.identify import identify
 from echospline.cli.info import info
 from echospline.cli.link import link
 from echospline.cli.live import live
 from echospline.cli.sessions import sessions
 from echospline.cli.simulate import demo, simulate
+from echospline.cli.study import study
 from echospline.errors import EchosplineError
 
 app = typer.Typer(
@@ -26,6 +28,8 @@ app = typer.Typer(
 app.command()(simulate)
 app.command()(demo)
 app.command()(info)
+app.command()(identify)
+app.command()(study)
 app.command()(live)
 app.add_typer(sessions, name="sessions")
 app.command()(link)

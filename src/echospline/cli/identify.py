@@ -1,0 +1,121 @@
+"""``echospline identify``: observed displacements in, parameters that ``simulate`` runs out."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from echospline.calibrate import calibrate
+from echospline.errors import InputError
+from echospline.sweep import Task, sweep
+
+
+def identify(
+    fields: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="FIELD...",
+            help="displacement.npz of a simulation or a tracking, or a folder that holds one; several make a cohort",
+        ),
+    ],
+    out: Annotated[Path, typer.Option("--out", help="folder for the results")] = Path("out/identify"),
+    scenario: Annotated[
+        Path | None,
+        typer.Option("--scenario", help="the scene (.toml); by default scenario.toml beside each field"),
+    ] = None,
+    model: Annotated[
+        str | None, typer.Option("--model", help="tps, elastic, green or fem; by default the scenario's")
+    ] = None,
+    objective: Annotated[
+        str, typer.Option("--objective", help="what is made least: mae or rmse (24)")
+    ] = "mae",
+    method: Annotated[
+        str,
+        typer.Option(
+            "--method", help="closed (closed form and a small search) or grid (the paper's brute force)"
+        ),
+    ] = "closed",
+    frames: Annotated[
+        int, typer.Option("--frames", min=0, help="frames used, evenly spaced; 0 for all")
+    ] = 60,
+    runs: Annotated[int, typer.Option("--runs", min=8, help="simulations of --method grid")] = 2000,
+    bootstrap: Annotated[
+        int, typer.Option("--bootstrap", min=0, help="resamples for the 95 % intervals")
+    ] = 200,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="of the search and the bootstrap")] = 0,
+    workers: Annotated[
+        int, typer.Option("--workers", min=0, help="processes on this machine; 0 for none")
+    ] = 0,
+    scheduler: Annotated[
+        str | None, typer.Option("--scheduler", metavar="TCP://HOST:PORT", help="a running dask scheduler")
+    ] = None,
+    json_: Annotated[bool, typer.Option("--json", help="print the reports as JSON, nothing else")] = False,
+) -> None:
+    """Find the parameters with which a model answers as the tissue did.
+
+    Writes `identified.toml` (run it with `echospline simulate`), `identification.json` (errors, 95 % intervals, what the
+    data cannot tell apart) and `error_map.png`. Several fields run one after another, on `--workers` or on a cluster;
+    each result is on disk as soon as it is known, and a run that was interrupted goes on where it stopped.
+    """
+    names = _names(fields)
+    tasks = []
+    for name, field in zip(names, fields, strict=True):
+        folder = out if len(fields) == 1 else out / name
+        arguments: dict[str, Any] = {
+            "field": str(Path(field).resolve()), "out": str(folder.resolve()),
+            "scenario": None if scenario is None else str(scenario.resolve()), "model": model, "objective": objective,
+            "method": method, "frames": frames, "runs": runs, "bootstrap": bootstrap, "seed": seed,
+        }  # fmt: skip
+        tasks.append(Task(name, arguments))
+    if len(tasks) == 1 and not workers and scheduler is None:
+        reports = {names[0]: calibrate(**tasks[0].arguments)}
+        failed: dict[str, str] = {}
+    else:
+        outcome = sweep(calibrate, tasks, out / "tasks", workers=workers, scheduler=scheduler)
+        reports, failed = outcome.results, outcome.failed
+    if json_:
+        json.dump({"reports": reports, "failed": failed}, sys.stdout, indent=1)
+        print()
+    else:
+        _tell(reports, out)
+    if failed:
+        name, why = next(iter(failed.items()))
+        raise InputError(f"{len(failed)} of {len(tasks)} fields could not be identified; {name}: {why}")
+
+
+def _names(fields: list[str]) -> list[str]:
+    """One name per field, from its file or folder, numbered where two are alike."""
+    stems = []
+    for field in fields:
+        path = Path(field).resolve()
+        stem = (
+            path.name if path.is_dir() else (path.parent.name if path.stem == "displacement" else path.stem)
+        )
+        stems.append("".join(c if c.isalnum() or c in "._-" else "_" for c in stem).lstrip("._-") or "field")
+    return [s if stems.count(s) == 1 else f"{s}-{i + 1}" for i, s in enumerate(stems)]
+
+
+def _tell(reports: dict[str, Any], out: Path) -> None:
+    console = Console()
+    for name, report in reports.items():
+        table = Table(title=f"{name}: {report['model']}, {report['method']}", title_justify="left")
+        for heading in ("parameter", "value", "95 % interval"):
+            table.add_column(heading, justify="left" if heading == "parameter" else "right")
+        for key, value in report["values"].items():
+            low, high = report["interval_95_percent"].get(key, (None, None))
+            table.add_row(key, f"{value:.4g}", "" if low is None else f"{low:.4g} to {high:.4g}")
+        console.print(table)
+        console.print(
+            f"MAE {report['mae_mm']:.4f} mm ({report['mae_percent_of_mean']:.1f} % of the mean displacement), "
+            f"RMSE {report['rmse_mm']:.4f} mm ({report['rmse_percent_of_mean']:.1f} %); "
+            f"{report['frames']} frames, {report['runs']} evaluations, {report['seconds']:.1f} s"
+        )
+        for sentence in report["cannot_be_told_apart"]:
+            console.print(f"[yellow]{sentence}[/]")
+    console.print(f"results in {out}")
