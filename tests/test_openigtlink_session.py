@@ -448,6 +448,35 @@ def test_an_asymmetric_picture_of_any_orientation_is_turned_to_mf(
     assert turned.shape == pixels.shape
 
 
+def test_pages_follow_the_tracker_that_steers_the_link(tmp_path: Path) -> None:
+    """`echospline live --link`: what the tracker does is seen by the page's own engine."""
+    from websockets.sync.client import connect  # noqa: PLC0415
+
+    from echospline.viewer.protocol import PoseCommand, decode_frame, encode_command  # noqa: PLC0415
+    from echospline.viewer.server import steer  # noqa: PLC0415
+    from live_scene import running  # noqa: PLC0415
+
+    with (
+        running(tmp_path) as (address, _, app),
+        Session(
+            make_stage(), SessionOptions(port=0), moved=lambda pose, new: steer(app, pose, new)
+        ) as session,
+        connect(address.replace("http", "ws") + "/live") as page,
+    ):
+        page.recv(PATIENCE)
+        console = Console(session.port)
+        console.tip(pose_at(0.5))
+        console.tip(pose_at(9.0))
+        tip, drawn = (0.0, 0.0), 0
+        while not np.allclose(tip, pose_at(9.0).tip, atol=1e-3):
+            data = page.recv(PATIENCE)
+            if isinstance(data, bytes):
+                frame = decode_frame(data)
+                tip, drawn = frame.tip, drawn + 1
+                page.send(encode_command(PoseCommand(frame.number, drawn, 0.0, None)))
+        console.close()
+
+
 def test_the_command_runs_and_refuses_in_words() -> None:
     runner = CliRunner()
     good = runner.invoke(app, ["link", "--port", "0", "--duration", "0.3", "--mesh-rate", "0"])
@@ -455,11 +484,11 @@ def test_the_command_runs_and_refuses_in_words() -> None:
     assert "OpenIGTLink on 127.0.0.1:" in good.output
     for arguments, reason in [
         (["--orientation", "FM"], "MF, UF, MN, UN"),
-        (["--axis", "q"], "x, -x"),
+        (["--needle-axis", "q"], "x, -x"),
         (["--connect", "host:port"], "HOST:PORT"),
         (["--no-serve"], "nothing to do"),
-        (["--target", "1"], "two numbers"),
-        (["--fps", "0"], "above 0"),
+        (["--target", "1"], "X,Y in mm"),
+        (["--fps", "0"], "--fps"),
     ]:
         bad = runner.invoke(app, ["link", "--port", "0", "--duration", "0.1", *arguments])
         assert isinstance(bad.exception, InputError)

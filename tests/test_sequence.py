@@ -15,7 +15,9 @@ import SimpleITK
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
+from echospline.cli.app import app
 from echospline.errors import InputError
 from echospline.grid import RegularGrid
 from echospline.image import UltrasoundImage
@@ -345,3 +347,37 @@ def test_frames_that_do_not_belong_are_refused(
 def test_an_unknown_ending_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"NAME\.igs\.mha"):
         SequenceWriter(tmp_path / "a.mp4", GRID)
+
+
+def test_simulate_writes_recordings_that_carry_the_needle(tmp_path: Path) -> None:
+    words = [
+        "--mesh",
+        "12x10",
+        "--entry",
+        "10,0",
+        "--angle",
+        "60",
+        "--depth",
+        "6",
+        "--speed",
+        "12",
+        "--dwell",
+        "0",
+    ]
+    extra = [
+        "--no-retract",
+        "--fps",
+        "5",
+        "--formats",
+        "igs.mha,seq.nrrd",
+        "--no-figure",
+        "--no-displacement",
+        "--json",
+    ]
+    answer = CliRunner().invoke(app, ["simulate", "sample:calf", "--out", str(tmp_path), *words, *extra])
+    assert answer.exit_code == 0
+    for name in ("run.igs.mha", "run.seq.nrrd"):
+        insertion = read_sequence(tmp_path / name).insertion()
+        np.testing.assert_allclose(insertion.entry[0], (10, 0), atol=1e-9)
+        depth = np.hypot(*(insertion.tip - insertion.entry).T)
+        np.testing.assert_allclose(depth, 12 * insertion.times, atol=1e-9)

@@ -21,9 +21,13 @@ from echospline.io import DisplacementWriter, open_writer
 from echospline.io.part import give_name, part_of
 from echospline.mechanics.model import State, TissueModel
 from echospline.scenario import Scenario
+from echospline.sequence import SequenceWriter
 from echospline.simulate import Frame, ImageFormer, frame_count, simulate
 
-SUFFIX = {"mp4": "cine.mp4", "gif": "cine.gif", "png": "frames", "mha": "cine.mha"}
+SUFFIX = {
+    "mp4": "cine.mp4", "gif": "cine.gif", "png": "frames", "mha": "cine.mha",
+    "igs.mha": "run.igs.mha", "seq.nrrd": "run.seq.nrrd",
+}  # fmt: skip
 WITNESSES = ("echospline", "numpy", "scipy", "numba", "opencv-python-headless", "scikit-fem", "av")
 """Packages whose versions a report names."""
 
@@ -44,6 +48,17 @@ class _Tally:
         self.residual = max(self.residual, frame.residual)
         if frame.folds:
             self.folded.append({"time_s": round(frame.time, 6), "what": str(frame.folds)})
+
+
+def _sink(
+    name: str, stack: ExitStack, out: Path, image: UltrasoundImage, fps: float
+) -> Callable[[Frame], None]:
+    """Open the writer of one format."""
+    if name in ("igs.mha", "seq.nrrd"):  # for PLUS and 3D Slicer: the needle's transforms beside the pictures
+        recording = stack.enter_context(SequenceWriter(out / SUFFIX[name], image.grid))
+        return lambda frame: recording.add(frame.image.pixels, frame.time, frame.pose)
+    cine = stack.enter_context(open_writer(out / SUFFIX[name], image.grid, fps))
+    return lambda frame: cine.add(frame.image.pixels, frame.time)
 
 
 def run(
@@ -95,12 +110,10 @@ def run(
     tally, files = _Tally(), []
     first = shown = deepest = None
     with ExitStack() as stack:
-        writers = []
+        sinks = []
         for name in dict.fromkeys(output.formats):
             files.append(SUFFIX[name])
-            writers.append(
-                (name, stack.enter_context(open_writer(out / SUFFIX[name], image.grid, output.fps)))
-            )
+            sinks.append(_sink(name, stack, out, image, output.fps))
         record = None
         if output.displacement:
             files.append("displacement.npz")
@@ -117,8 +130,8 @@ def run(
             form_image=form_image,
         ):
             since = perf_counter()
-            for _, writer in writers:
-                writer.add(frame.image.pixels, frame.time)
+            for sink in sinks:
+                sink(frame)
             if record is not None:
                 record.add(frame.displacement, frame.time, frame.pose)
             frame.milliseconds["write"] = 1000 * (perf_counter() - since)

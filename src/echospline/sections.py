@@ -200,8 +200,8 @@ class OutputSection(Section):
 
     fps: float = Field(25.0, gt=0, le=1000, description="frames per second")
     longest_step: Seconds = Field(1 / 30, gt=0, le=10, description="longest time step of the model, s")
-    formats: list[Literal["mp4", "gif", "png", "mha"]] = Field(
-        ["mp4"], description="cines: mp4, gif, png, mha"
+    formats: list[Literal["mp4", "gif", "png", "mha", "igs.mha", "seq.nrrd"]] = Field(
+        ["mp4"], description="cines: mp4, gif, png, mha; with the needle's transforms: igs.mha, seq.nrrd"
     )
     displacement: bool = Field(True, description="write displacement.npz, the true motion")
     figure: bool = Field(True, description="write summary.png")

@@ -5,14 +5,16 @@ from __future__ import annotations
 import logging
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
+from threadpoolctl import threadpool_limits
 
+from echospline.cli.options import scenario_from, with_scenario_options
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
 from echospline.image import UltrasoundImage
 from echospline.live import LiveEngine
 from echospline.models import MODELS, build_model
@@ -23,149 +25,156 @@ from echospline.openigtlink.plus import read_calibration
 from echospline.openigtlink.scene import Reach
 from echospline.openigtlink.session import Rates, Session, SessionOptions, Stage
 from echospline.openigtlink.tracking import Naming
-from echospline.scenario import Scenario, load, validated
+from echospline.scenario import Scenario, load
 
-AXES = {"x": (1, 0, 0), "-x": (-1, 0, 0), "y": (0, 1, 0), "-y": (0, -1, 0), "z": (0, 0, 1), "-z": (0, 0, -1)}
+AXES = {
+    "x": (1.0, 0.0, 0.0), "-x": (-1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0),
+    "z": (0.0, 0.0, 1.0), "-z": (0.0, 0.0, -1.0),
+}  # fmt: skip
 ORIENTATIONS = ("MF", "UF", "MN", "UN")
 
 
+@with_scenario_options
 def link(
     source: Annotated[
         str,
         typer.Argument(
-            metavar="[IMAGE_OR_SCENARIO]", help="Image, cine or DICOM file, or a scenario (.toml)."
+            metavar="[IMAGE_OR_SCENARIO]",
+            help="an image, cine or DICOM file, sample:calf, or a scenario (.toml)",
         ),
     ] = "sample:calf",
     port: Annotated[
-        int, typer.Option(min=0, max=65535, help="Port to listen on; 0 takes any free one.")
+        int, typer.Option(min=0, max=65535, help="port to listen on; 0 takes any free one")
     ] = PORT,
     host: Annotated[
         str,
-        typer.Option(
-            help="Address to listen on. OpenIGTLink knows no password: open it to trusted networks only."
-        ),
+        typer.Option(help="address to listen on; OpenIGTLink knows no password, so trusted networks only"),
     ] = "127.0.0.1",
     connect: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="HOST:PORT", help="Connect to a server as well (PLUS, a tracker); may be repeated."
+            metavar="HOST:PORT", help="a server to connect to as well (PLUS, a tracker); may be repeated"
         ),
     ] = None,
-    serve: Annotated[bool, typer.Option(help="Listen for peers; without, only connect.")] = True,
-    spacing: Annotated[
-        str | None,
-        typer.Option(metavar="LATERAL,DEPTH", help="mm per pixel, where the image file does not say."),
-    ] = None,
-    orientation: Annotated[
-        str,
-        typer.Option(
-            help="Which way the picture lies in its file, in PLUS' letters: columns grow to the Marked or Unmarked side, "
-            "rows to the Far or Near end. It is turned to MF."
-        ),
-    ] = "MF",
-    model: Annotated[str | None, typer.Option(help=f"Tissue model: {', '.join(MODELS)}.")] = None,
-    needle: Annotated[
+    serve: Annotated[
+        bool, typer.Option("--serve/--no-serve", help="listen for peers, or only connect")
+    ] = True,
+    needle_frame: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="FRAME", help="Frame at the needle's tip; may be repeated. Default: NeedleTip, StylusTip."
+            metavar="FRAME",
+            help="frame at the needle's tip; may be repeated  [default: NeedleTip, StylusTip]",
         ),
     ] = None,
-    axis: Annotated[
-        str, typer.Option(help="Direction of insertion in that frame: x, -x, y, -y, z, -z.")
+    needle_axis: Annotated[
+        str, typer.Option(metavar="AXIS", help="direction of insertion in that frame: x, -x, y, -y, z, -z")
     ] = "z",
     reference: Annotated[
-        str, typer.Option(metavar="FRAME", help="Frame that everything is told in.")
+        str, typer.Option(metavar="FRAME", help="frame that everything is told in")
     ] = "Reference",
     image_name: Annotated[
-        str, typer.Option(metavar="NAME", help="Device name and frame of the image.")
+        str, typer.Option(metavar="NAME", help="device name and frame of the image")
     ] = "Image",
     embed: Annotated[
         bool,
         typer.Option(
-            help="Send the image with its place in the reference frame; without, send ImageToReference beside it."
+            "--embed/--no-embed",
+            help="send the image in its place, or in pixels with ImageToReference beside it",
         ),
     ] = True,
+    orientation: Annotated[
+        str,
+        typer.Option(
+            metavar="MF|UF|MN|UN",
+            help="how the picture lies in its file: columns grow to the Marked or Unmarked side of the probe, rows to the "
+            "Far or Near end; it is turned to MF",
+        ),
+    ] = "MF",
     config: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE.xml", help="PLUS device set file: its CoordinateDefinitions are the calibration."
+            metavar="FILE.xml", help="PLUS device set file whose CoordinateDefinitions are the calibration"
         ),
     ] = None,
     beam: Annotated[
-        float, typer.Option(metavar="MM", help="Thickness of the beam (FWHM): the needle fades beyond.")
+        float,
+        typer.Option(
+            metavar="MM", help="thickness of the beam (full width at half maximum): the needle fades beyond"
+        ),
     ] = 4.0,
     contact: Annotated[
         float,
-        typer.Option(metavar="MM", help="Distance from the plane beyond which the needle moves no tissue."),
+        typer.Option(
+            metavar="MM", help="distance from plane and image beyond which the needle moves no tissue"
+        ),
     ] = 10.0,
     target: Annotated[
         list[str] | None,
-        typer.Option(metavar="X,Y", help="Point in mm that is followed and sent as POINT; may be repeated."),
+        typer.Option(
+            metavar="X,Y", help="point of the tissue, mm, that is followed and sent as POINT; may be repeated"
+        ),
     ] = None,
-    fps: Annotated[float, typer.Option(help="Images per second, at most 1000.")] = 30.0,
     mesh_rate: Annotated[
-        float, typer.Option(help="Displaced meshes (POLYDATA) per second; 0 for none.")
+        float, typer.Option(metavar="N", help="displaced meshes (POLYDATA) per second; 0 for none")
     ] = 5.0,
-    rate: Annotated[float, typer.Option(help="Steps of the tissue per second.")] = 120.0,
+    rate: Annotated[float, typer.Option(min=10, max=1000, help="model steps per second")] = 120.0,
     scenarios: Annotated[
         Path | None,
-        typer.Option(metavar="FOLDER", help="Scenarios that peers may load by name; without, none."),
+        typer.Option(metavar="FOLDER", help="scenarios that peers may load by name; without, none"),
     ] = None,
     duration: Annotated[
-        float, typer.Option(min=0, help="Seconds after which to end; 0 runs until Ctrl-C.")
+        float, typer.Option(metavar="S", min=0, help="end after so many seconds; 0 runs until Ctrl+C")
     ] = 0.0,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Say nothing but warnings.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="say nothing but warnings")] = False,
+    changes: dict[str, Any] | None = None,
 ) -> None:
-    """Join the network of 3D Slicer and PLUS: transforms move the needle, the deforming image comes back."""
+    """Join the network of 3D Slicer and PLUS: transforms move the needle, the deforming image comes back.
+
+    Images go out at the scenario's frames per second (--fps). docs/slicer.md shows how to connect step by step.
+    """
     logging.basicConfig(
         level=logging.WARNING if quiet else logging.INFO, format="%(message)s", stream=sys.stderr, force=True
     )
+    scenario, folder = scenario_from(source, changes or {})
     naming = Naming(
-        needles=tuple(needle) if needle else ("NeedleTip", "StylusTip"),
+        needles=tuple(needle_frame) if needle_frame else ("NeedleTip", "StylusTip"),
         reference=reference,
         image=image_name,
-        axis=_choice("--axis", axis, AXES),
+        axis=_axis(needle_axis),
         calibration=read_calibration(config) if config else {},
     )
-    if orientation not in ORIENTATIONS:
-        raise InputError(f"--orientation is one of {', '.join(ORIENTATIONS)}; got {orientation}")
-    scenario, folder = _scenario(source, spacing)
     options = SessionOptions(
         host=host if serve else "",
         port=port,
-        connect=tuple(_address(text) for text in connect or ()),
+        connect=tuple(address(text) for text in connect or ()),
         looks=Looks(naming, embed, scenario.needle_echo()),
         reach=Reach(thickness=beam, contact=contact),
-        rates=Rates(fps, mesh_rate),
+        rates=Rates(scenario.output.fps, mesh_rate),
     )
     if not options.host and not options.connect:
-        raise InputError("nothing to do: without --serve give --connect HOST:PORT")
-    stage = make_stage(
-        scenario, folder, model, orientation, rate, [_pair("--target", t) for t in target or ()]
-    )
+        raise InputError("nothing to do: with --no-serve give --connect HOST:PORT")
+    stage = make_stage(scenario, folder, orientation, rate, [_point(text) for text in target or ()])
 
     def load_named(name: str) -> Stage:
         assert scenarios is not None  # otherwise it is not passed on
-        if Path(name).name != name or name.startswith("."):
-            raise InputError(f"a scenario is named without folders; got {name!r}")
-        return make_stage(load(scenarios / name), scenarios, model, orientation, rate, [])
+        if Path(name).name != name or not name.endswith(".toml"):
+            raise InputError(f"a scenario is named NAME.toml, without folders; got {name!r}")
+        return make_stage(load(scenarios / name), scenarios, orientation, rate, [])
 
-    with Session(stage, options, load_named if scenarios else None) as session:
+    # An engine's step is short: more threads make it slower, and late.
+    with threadpool_limits(limits=1), Session(stage, options, load_named if scenarios else None) as session:
         if not quiet:
             where = f"OpenIGTLink on {host}:{session.port}" if serve else "OpenIGTLink"
-            print(f"{where}: {_summary(stage)}. Ctrl-C ends it.", flush=True)
+            print(f"{where}: {_summary(stage)}; Ctrl+C ends", flush=True)
         until = time.monotonic() + duration if duration else float("inf")
-        try:
+        with suppress(KeyboardInterrupt):
             while not session.wait(0.2) and time.monotonic() < until:
                 pass
-        except KeyboardInterrupt:
-            pass
 
 
 def make_stage(
     scenario: Scenario,
     folder: Path,
-    model: str | None = None,
     orientation: str = "MF",
     rate: float = 120.0,
     targets: list[tuple[float, float]] | None = None,
@@ -178,8 +187,6 @@ def make_stage(
         What is simulated.
     folder : Path
         Where its relative paths start.
-    model : str, optional
-        Another model than the scenario's.
     orientation : {"MF", "UF", "MN", "UN"}
         Which way the picture lies in its file.
     rate : float
@@ -193,7 +200,7 @@ def make_stage(
     entry = (float(insertion.entry[0, 0]), float(insertion.entry[0, 1]))
     engine = LiveEngine(
         lambda kind: build_model(scenario, grid, kind=kind, folder=folder),
-        model or scenario.model.kind,
+        scenario.model.kind,
         NeedlePose(entry, entry),
         rate=rate,
     )
@@ -203,27 +210,21 @@ def make_stage(
 
 
 def oriented(image: UltrasoundImage, orientation: str) -> UltrasoundImage:
-    """Turn a picture of another orientation to MF: columns to the marked side, rows away from the probe."""
+    """Turn a picture of another orientation to MF: columns to the marked side, rows away from the probe.
+
+    Raises
+    ------
+    InputError
+        If there is no such orientation.
+    """
+    if orientation not in ORIENTATIONS:
+        raise InputError(f"--orientation is one of {', '.join(ORIENTATIONS)}; got {orientation!r}")
     pixels = image.pixels
     if orientation[0] == "U":
         pixels = pixels[:, ::-1]
     if orientation[1] == "N":
         pixels = pixels[::-1]
-    grid: RegularGrid = image.grid
-    return UltrasoundImage(np.ascontiguousarray(pixels), grid, image.source)
-
-
-def _scenario(source: str, spacing: str | None) -> tuple[Scenario, Path]:
-    if source.lower().endswith(".toml"):
-        if spacing:
-            raise InputError("a scenario says its own spacing: leave --spacing out")
-        return load(source), Path(source).parent
-    image: dict[str, object] = {
-        "file": source if source.startswith("sample:") else str(Path(source).absolute())
-    }
-    if spacing:
-        image["spacing"] = list(_pair("--spacing", spacing))
-    return validated({"format": 1, "image": image}, "command line"), Path()
+    return UltrasoundImage(np.ascontiguousarray(pixels), image.grid, image.source)
 
 
 def _summary(stage: Stage) -> str:
@@ -233,25 +234,31 @@ def _summary(stage: Stage) -> str:
     return f"image {x1 - x0:.1f} x {y1 - y0:.1f} mm, {name} on {stage.engine.model.grid.size} nodes"
 
 
-def _pair(option: str, text: str) -> tuple[float, float]:
-    try:
-        first, second = (float(part) for part in text.split(","))
-    except ValueError:
-        raise InputError(f"{option} takes two numbers in mm with a comma between; got {text!r}") from None
-    return first, second
+def address(text: str) -> tuple[str, int]:
+    """Host and port of ``HOST:PORT``; without a port OpenIGTLink's own.
 
-
-def _address(text: str) -> tuple[str, int]:
+    Raises
+    ------
+    InputError
+        If the port is no number from 1 to 65535.
+    """
     host, colon, port = text.rpartition(":")
     if not colon:
         return text, PORT
-    if not port.isdigit() or not 0 < int(port) < 65536:
-        raise InputError(f"--connect takes HOST:PORT; got {text!r}")
+    if not host or not port.isdigit() or not 0 < int(port) < 65536:
+        raise InputError(f"--connect expects HOST:PORT; got {text!r}")
     return host, int(port)
 
 
-def _choice(option: str, text: str, choices: dict[str, tuple[int, int, int]]) -> tuple[float, float, float]:
-    if text not in choices:
-        raise InputError(f"{option} is one of {', '.join(choices)}; got {text}")
-    x, y, z = choices[text]
-    return float(x), float(y), float(z)
+def _point(text: str) -> tuple[float, float]:
+    try:
+        x, y = (float(part) for part in text.split(","))
+    except ValueError:
+        raise InputError(f"--target expects X,Y in mm; got {text!r}") from None
+    return x, y
+
+
+def _axis(text: str) -> tuple[float, float, float]:
+    if text not in AXES:
+        raise InputError(f"--needle-axis is one of {', '.join(AXES)}; got {text!r}")
+    return AXES[text]

@@ -6,6 +6,7 @@ import logging
 import os
 import webbrowser
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,15 +14,21 @@ import typer
 from rich.console import Console
 from threadpoolctl import threadpool_limits
 
+from echospline.cli.link import address, make_stage
 from echospline.cli.options import scenario_from, with_scenario_options
 from echospline.errors import InputError
 from echospline.image import UltrasoundImage
 from echospline.models import MODELS, build_model
 from echospline.needle_echo import NeedleEcho
+from echospline.openigtlink.link import PORT
+from echospline.openigtlink.picture import Looks
+from echospline.openigtlink.plus import read_calibration
+from echospline.openigtlink.session import Rates, Session, SessionOptions
+from echospline.openigtlink.tracking import Naming
 from echospline.scenario import Scenario
 from echospline.viewer.exercise import default_exercises
 from echospline.viewer.scene import Scene
-from echospline.viewer.server import Settings, build_app, serve
+from echospline.viewer.server import Settings, build_app, serve, steer
 from echospline.viewer.sessions import Sessions
 
 LABELS = {"tps": "TPS", "elastic": "Elastic", "green": "Green", "fem": "FEM"}
@@ -54,6 +61,22 @@ def live(
         typer.Option(help="file that keeps training sessions; by default in the user's data folder"),
     ] = None,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="open the page")] = True,
+    link: Annotated[
+        bool,
+        typer.Option(
+            "--link/--no-link", help="a tracker or 3D Slicer steers the needle over OpenIGTLink as well"
+        ),
+    ] = False,
+    link_port: Annotated[
+        int, typer.Option(min=0, max=65535, help="port for it on this machine; 0 takes any free one")
+    ] = PORT,
+    link_connect: Annotated[
+        list[str] | None,
+        typer.Option(metavar="HOST:PORT", help="an OpenIGTLink server to connect to; may be repeated"),
+    ] = None,
+    link_config: Annotated[
+        Path | None, typer.Option(metavar="FILE.xml", help="PLUS device set file with the calibration")
+    ] = None,
     changes: dict[str, Any] | None = None,
 ) -> None:
     """Steer the needle in the browser and see the tissue move.
@@ -76,7 +99,26 @@ def live(
         if browser:
             webbrowser.open(address)
 
-    with threadpool_limits(limits=1):  # an engine's step is short: more threads make it slower, and late
+    with ExitStack() as stack:
+        stack.enter_context(
+            threadpool_limits(limits=1)
+        )  # an engine's step is short: more threads make it slower, and late
+        if link or link_connect:
+            session = Session(
+                make_stage(scenario, folder, rate=rate),
+                SessionOptions(
+                    port=link_port,
+                    connect=tuple(address(text) for text in link_connect or ()),
+                    looks=Looks(
+                        Naming(calibration=read_calibration(link_config) if link_config else {}),
+                        echo=scenario.needle_echo(),
+                    ),
+                    rates=Rates(scenario.output.fps),
+                ),
+                moved=lambda pose, appears: steer(app, pose, appears),
+            )
+            stack.enter_context(session)
+            console.print(f"OpenIGTLink on 127.0.0.1:{session.port}", highlight=False)
         serve(app, settings, ready)
 
 

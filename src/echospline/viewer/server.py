@@ -27,6 +27,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from echospline.errors import EchosplineError, InputError
+from echospline.needle import NeedlePose
 from echospline.viewer.client import Client, Seat
 from echospline.viewer.guard import SUBPROTOCOL, Guard
 from echospline.viewer.protocol import COMMAND_BYTES, REQUEST_BYTES
@@ -90,6 +91,7 @@ class Room:
     opener: SceneOpener | None = None
     clients: int = 0
     parked: OrderedDict[str, tuple[float, Seat]] = field(default_factory=OrderedDict)
+    taken: list[Seat] = field(default_factory=list)
 
     def scene(self, name: str) -> Scene | None:
         """One scene; the empty name is the one that the server was started with."""
@@ -152,6 +154,24 @@ def build_app(
     )
     app.state.room = room
     return app
+
+
+def steer(app: Starlette, pose: NeedlePose, appears: bool) -> None:
+    """Let a tracker steer the needle of every page that shows the scene the server was started with.
+
+    Parameters
+    ----------
+    app : Starlette
+        From `build_app`.
+    pose : NeedlePose
+        Where the needle is.
+    appears : bool
+        Whether it has just come into sight: then it is put there, not thrust there.
+    """
+    room: Room = app.state.room
+    for seat in list(room.taken):
+        if seat.scene is room.scene(""):
+            (seat.engine.place if appears else seat.engine.command)(pose.entry, pose.tip)
 
 
 def serve(
@@ -334,9 +354,11 @@ async def _live(websocket: WebSocket) -> None:
     room.clients += 1
     try:
         seat, resumed = await asyncio.to_thread(room.take_seat, key, name, scene)
+        room.taken.append(seat)
         try:
             await Client(websocket, seat, room.sessions).serve(resumed)
         finally:
+            room.taken.remove(seat)
             if _KEY.fullmatch(key):
                 room.park(key, seat)
     except WebSocketDisconnect:
