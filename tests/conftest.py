@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: more threads only wait for each other
 settings.register_profile("untimed", deadline=None)  # speed is measured in benchmarks/, never asserted
 settings.load_profile("untimed")
 

@@ -14,6 +14,7 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from echospline.errors import InputError
 from echospline.image import UltrasoundImage
@@ -110,6 +111,8 @@ def run(
     tally, files = _Tally(), []
     first = shown = deepest = None
     with ExitStack() as stack:
+        # matrices of a few hundred rows: waking a second thread costs more than it brings
+        stack.enter_context(threadpool_limits(limits=1, user_api="blas"))
         sinks = []
         for name in dict.fromkeys(output.formats):
             files.append(SUFFIX[name])
