@@ -216,7 +216,7 @@ def test_lateral_and_depth_spacing_are_not_swapped(tmp_path: Path) -> None:
     assert cine.grid.spacing == (0.2, 0.1)
     np.testing.assert_array_equal(cine.frames, pixels[:, 5:35, 10:50])
     np.testing.assert_allclose(cine.times, [0, 0.05, 0.1])
-    ultrasound(tmp_path / "b.dcm", PixelSpacing=[0.3, 0.4], FrameTimeVector=[0, 40, 60])  # rows first
+    ultrasound(tmp_path / "b.dcm", PixelSpacing=[0.3, 0.4], FrameTimeVector=[7, 40, 60])  # rows first
     cine = read(tmp_path / "b.dcm")
     assert cine.grid.spacing == (0.4, 0.3)
     np.testing.assert_allclose(cine.times, [0, 0.04, 0.1])

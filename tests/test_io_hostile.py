@@ -23,6 +23,7 @@ from pydicom.data import get_testdata_file
 from echospline.errors import EchosplineError, InputError
 from echospline.grid import RegularGrid
 from echospline.io import DisplacementWriter, open_writer, read, read_displacement
+from echospline.io.displacement import displacement_shapes
 from echospline.needle import NeedlePose
 
 STACK = np.random.default_rng(7).integers(0, 256, (3, 12, 17), dtype=np.uint8)
@@ -152,7 +153,7 @@ def test_strangers_are_named(tmp_path: Path, content: bytes, says: str) -> None:
 def test_what_is_no_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="there is no file"):
         read(tmp_path / "missing.png", spacing=(0.1, 0.1))
-    with pytest.raises(InputError, match="is a folder"):
+    with pytest.raises(InputError, match="is a folder without pictures"):
         read(tmp_path, spacing=(0.1, 0.1))
     with pytest.raises(InputError, match="cannot read"):
         read(str(tmp_path / "a\0b.png"), spacing=(0.1, 0.1))
@@ -218,6 +219,9 @@ def test_a_displacement_record_must_hold_what_it_declares(tmp_path: Path, shape:
     (tmp_path / "a.npz").write_bytes(npz_of(shape, bytes(3 * 6 * 2 * 8)))
     with pytest.raises(InputError):
         read_displacement(tmp_path / "a.npz")
+    if shape.count(",") == 2 and "-" not in shape:  # what is declared is checked before any array is read
+        with pytest.raises(InputError, match="declares shape .* but holds 288 bytes"):
+            displacement_shapes(tmp_path / "a.npz")
 
 
 def test_a_zip_bomb_is_refused_before_it_is_inflated(tmp_path: Path) -> None:

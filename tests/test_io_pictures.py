@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import islice
 from pathlib import Path
 
 import cv2
@@ -11,8 +12,9 @@ from PIL import Image
 
 from echospline.data import sample_image
 from echospline.errors import InputError
+from echospline.grid import RegularGrid
 from echospline.image import Cine, UltrasoundImage
-from echospline.io import read
+from echospline.io import open_cine, open_writer, read
 
 
 def test_shipped_image_is_the_crop_its_note_describes(recordings: Path) -> None:
@@ -135,3 +137,52 @@ def test_region_outside_of_the_picture_is_refused(recordings: Path, region: tupl
 def test_spacing_must_be_two_positive_lengths(recordings: Path, spacing: tuple[float, ...]) -> None:
     with pytest.raises(InputError, match="spacing must be two positive numbers"):
         read(recordings / "itkpocus" / "interson-phantom.png", spacing=spacing)
+
+
+def test_a_folder_of_numbered_pictures_is_a_cine(recordings: Path) -> None:
+    folder = recordings / "timtrack"
+    box = (112, 64, 688, 520)
+    cine = read(folder, spacing=(0.0866, 0.0866), fps=15, region=box)
+    assert isinstance(cine, Cine)
+    assert cine.frames.shape == (23, 456, 576)
+    np.testing.assert_array_equal(cine.frames[0], sample_image().pixels)
+    assert read(folder, spacing=(0.0866, 0.0866), frame=-1, region=box).pixels.shape == (456, 576)
+    streamed = [image.pixels for _, image in islice(open_cine(folder, spacing=(1, 1), fps=15, region=box), 3)]
+    np.testing.assert_array_equal(streamed, cine.frames[:3])
+    with pytest.raises(InputError, match="--fps"):
+        read(folder, spacing=(0.0866, 0.0866))
+
+
+def test_pictures_follow_their_numbers_and_their_table_of_times(tmp_path: Path) -> None:
+    for k in (1, 2, 10, 9):
+        Image.fromarray(np.full((4, 5), k, np.uint8)).save(tmp_path / f"frame_{k}.png")
+    (tmp_path / "notes.txt").write_text("left alone")
+    (tmp_path / "times.csv").write_text("frame,time_s\n0,5.0\n1,5.1\n2,5.3\n3,5.4\n")
+    cine = read(tmp_path, spacing=(1, 1))
+    np.testing.assert_array_equal(cine.frames[:, 0, 0], [1, 2, 9, 10])
+    np.testing.assert_allclose(cine.times, [0, 0.1, 0.3, 0.4])
+    (tmp_path / "times.csv").write_text("frame,time_s\n0,5.0\n")
+    with pytest.raises(InputError, match="each of the 4 pictures"):
+        read(tmp_path, spacing=(1, 1))
+
+
+def test_frames_written_here_come_back_as_a_cine(tmp_path: Path) -> None:
+    frames = np.random.default_rng(0).integers(0, 2**16, (3, 6, 7), dtype=np.uint16)
+    grid = RegularGrid((7, 6), (0.1, 0.3))
+    with open_writer(tmp_path / "frames", grid, 30) as writer:
+        for k, pixels in enumerate(frames):
+            writer.add(pixels, 0.2 * k)
+    cine = read(tmp_path / "frames")
+    np.testing.assert_array_equal(cine.frames, frames)
+    np.testing.assert_allclose(cine.times, [0, 0.2, 0.4])
+    assert cine.grid == grid
+
+
+def test_a_picture_that_does_not_belong_is_named(tmp_path: Path) -> None:
+    for k, size in enumerate([(4, 5), (4, 5), (6, 5)]):
+        Image.fromarray(np.zeros(size, np.uint8)).save(tmp_path / f"{k}.png")
+    with pytest.raises(InputError, match=r"2\.png has rows 6"):
+        read(tmp_path, spacing=(1, 1), fps=1)
+    (tmp_path / "2.png").write_bytes(b"GIF89a")
+    with pytest.raises(InputError, match=r"2\.png is GIF"):
+        read(tmp_path, spacing=(1, 1), fps=1)

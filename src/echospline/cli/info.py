@@ -77,6 +77,8 @@ def describe(file: str, limit: float = LIMIT) -> dict[str, Any]:
     if file.startswith(SAMPLE):
         return _of_sample(file.removeprefix(SAMPLE))
     path = Path(file)
+    if path.is_dir():
+        return {"file": str(path)} | _of_recording(open_recording(path, limit))
     kind, name = kind_of(path)
     about: dict[str, Any] = {"file": str(path), "format": name, "bytes": path.stat().st_size}
     if kind == "displacement":

@@ -72,7 +72,7 @@ def read(
     ----------
     path : str or Path
         PNG, JPEG, TIFF, BMP, GIF, DICOM, MHA/MHD, NRRD, NIfTI, MP4, AVI, MOV, MKV or WebM, told by content;
-        or ``"sample:calf"``, the image that ships with the package.
+        a folder of numbered pictures; or ``"sample:calf"``, the image that ships with the package.
     spacing : (lateral, depth), optional
         mm per pixel; needed where the file does not say, and preferred to what it says.
     frame : int, optional
@@ -170,6 +170,10 @@ def open_recording(path: str | Path, limit: float = LIMIT, *, whole: bool = True
     path = Path(path)
     if not (isfinite(limit) and limit > 0):
         raise InputError(f"limit must be a positive number of MiB; got {limit}")
+    if path.is_dir():
+        from echospline.io.folder import open_folder  # noqa: PLC0415
+
+        return open_folder(path, limit, whole=whole)
     kind, name = kind_of(path)
     # The readers' libraries are large: each is imported when a file of its kind comes.
     header_limit = limit if whole else float("inf")
