@@ -220,7 +220,7 @@ def test_a_displacement_record_must_hold_what_it_declares(tmp_path: Path, shape:
     with pytest.raises(InputError):
         read_displacement(tmp_path / "a.npz")
     if shape.count(",") == 2 and "-" not in shape:  # what is declared is checked before any array is read
-        with pytest.raises(InputError, match="declares shape .* but holds 288 bytes"):
+        with pytest.raises(InputError, match=r"declares shape .* but holds 288 bytes"):
             displacement_shapes(tmp_path / "a.npz")
 
 
