@@ -229,15 +229,18 @@ class Phantom:
         Echo
             Mean power 1 for speckle of 0 dB.
         """
-        return self.formed_at(self.moved(displacement), noise_seed, replaced, steering)
+        kept = self.scatterers.replaced(replaced, (noise_seed or 0) + 1) if replaced else self.scatterers
+        return self.formed_at(self.moved(displacement), noise_seed, steering, kept)
 
     def formed_at(
-        self, positions: Floats, noise_seed: int | None = None, replaced: float = 0.0, steering: float = 0.0
+        self,
+        positions: Floats,
+        noise_seed: int | None = None,
+        steering: float = 0.0,
+        scatterers: Scatterers | None = None,
     ) -> Echo:
         """As `form`, with the scatterers at given positions (n, 2) mm: several looks share one motion."""
-        scatterers = (
-            self.scatterers.replaced(replaced, (noise_seed or 0) + 1) if replaced else self.scatterers
-        )
+        scatterers = scatterers or self.scatterers
         p, lattice = positions, self.lattice
         k, theta = self.probe.carrier, np.radians(steering)
         spread = deposit(p, scatterers.amplitudes, lattice, (k * np.sin(theta), k * np.cos(theta)))

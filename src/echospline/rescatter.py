@@ -19,10 +19,11 @@ from echospline.errors import InputError
 from echospline.grid import Floats
 from echospline.image import UltrasoundImage
 from echospline.phantom import Phantom
+from echospline.phantom_cine import displacement_of
 from echospline.probe import FWHM, Probe
 from echospline.simulate import ImageFormer
 
-FINE = Probe(frequency=7.5, snr=50.0)
+FINE = Probe(frequency=7.5, snr=30.0)
 """A linear array for superficial tissue, the kind that took the image that ships with the package."""
 
 
@@ -53,8 +54,10 @@ def rescattered(
     """Phantom whose scatterers are as bright as the image, and the display that shows them alike."""
     display = display or Display()
     level = echogenicity(image, probe, display)
-    floor = -display.dynamic_range
-    level = np.maximum(level, floor - 20.0).astype(np.float32)
+    # the probe's snr is against speckle of 0 dB: make that the image's mean power
+    mean = float(10.0 * np.log10(np.mean(10.0 ** (level / 10.0)) + 1e-12))
+    level = np.maximum(level - mean, -display.dynamic_range - 20.0).astype(np.float32)
+    display = Display(display.dynamic_range, display.top - mean)
 
     def at(points: Floats) -> Floats:
         # OpenCV's maps hold at most 32767 columns
@@ -106,12 +109,7 @@ def rescatter(
     frame = count(seed * 1_000_003 + 1)
 
     def form(deformation: Deformation, inverse: InverseMap) -> UltrasoundImage:
-        def displacement(points: Floats) -> Floats:
-            x0, x1, y0, y1 = deformation.grid.extent
-            moved: Floats = deformation.forward(np.clip(points, (x0, y0), (x1, y1)))
-            return moved - np.clip(points, (x0, y0), (x1, y1))
-
-        p = phantom.moved(displacement)
+        p = phantom.moved(displacement_of(deformation))
         looks = [phantom.formed_at(p, noise_seed=next(frame), steering=angle).envelope() for angle in angles]
         mean = np.asarray(np.mean(looks, axis=0), dtype=np.complex64)
         return Echo(mean, phantom.samples, probe.carrier).b_mode(display, image.grid)

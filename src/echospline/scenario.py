@@ -24,6 +24,7 @@ from echospline.io import read_image
 from echospline.io.part import give_name, part_of
 from echospline.needle import Insertion
 from echospline.needle_echo import NeedleEcho
+from echospline.phantom_section import PhantomSection, ProbeSection
 from echospline.sections import (
     ExerciseSection,
     ImageSection,
@@ -55,6 +56,8 @@ class Scenario(Section):
     needle: NeedleSection = NeedleSection()
     model: ModelSection = ModelSection()
     output: OutputSection = OutputSection()
+    probe: ProbeSection = ProbeSection()
+    phantom: PhantomSection = PhantomSection()
     exercise: list[ExerciseSection] = Field(default=[], description="what can be trained live")
 
     def with_values(self, values: Mapping[str, Any], origin: str = "scenario") -> Scenario:

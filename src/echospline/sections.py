@@ -210,6 +210,10 @@ class OutputSection(Section):
         0.0, description="value where no tissue comes to lie"
     )
     folding: Literal["flag", "refuse"] = Field("flag", description="what happens when the picture folds")
+    image_model: Literal["warp", "rescatter"] = Field(
+        "warp",
+        description="warp the picture, or move scatterers as bright as it and image them anew ([probe])",
+    )
 
 
 class DiscSection(Section):

@@ -10,6 +10,7 @@ from echospline.cli.identify import identify
 from echospline.cli.info import info
 from echospline.cli.link import link
 from echospline.cli.live import live
+from echospline.cli.phantom import phantom
 from echospline.cli.sessions import sessions
 from echospline.cli.simulate import demo, simulate
 from echospline.cli.study import study
@@ -33,6 +34,7 @@ app.command()(study)
 app.command()(live)
 app.add_typer(sessions, name="sessions")
 app.command()(link)
+app.command()(phantom)
 
 
 def main() -> None:

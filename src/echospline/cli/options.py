@@ -91,6 +91,7 @@ OPTIONS = (
     Option("--formats", "output.formats", "NAME,...", _words, "Output"),
     Option("--border", "output.border", "VALUE", _border, "Output"),
     Option("--folding", "output.folding", "flag|refuse", None, "Output"),
+    Option("--image-model", "output.image_model", "warp|rescatter", None, "Output"),
     Option("--needle/--no-needle", "output.needle", "", None, "Output"),
     Option("--figure/--no-figure", "output.figure", "", None, "Output"),
     Option("--displacement/--no-displacement", "output.displacement", "", None, "Output"),

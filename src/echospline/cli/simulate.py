@@ -14,8 +14,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from echospline.cli.options import scenario_from, with_scenario_options
+from echospline.image import UltrasoundImage
 from echospline.models import build_model
+from echospline.rescatter import rescatter
 from echospline.run import run
+from echospline.scenario import Scenario
+from echospline.simulate import ImageFormer
 
 Out = Annotated[Path, typer.Option("--out", help="folder for the results, made where it is not there")]
 Json = Annotated[bool, typer.Option("--json", help="print the report of the run as JSON, nothing else")]
@@ -72,12 +76,23 @@ def simulate_into(source: str, out: Path, changes: dict[str, Any], *, as_json: b
             out,
             folder,
             progress=lambda done, count: bar.update(task, completed=done, total=count),
+            form_image=_image_former(scenario, image),
         )
     if as_json:
         json.dump(report, sys.stdout, indent=2)
         print()
         return
     _tell(report, out)
+
+
+def _image_former(scenario: Scenario, image: UltrasoundImage) -> ImageFormer | None:
+    """Return what forms the pictures where it is not the warp."""
+    if scenario.output.image_model == "warp":
+        return None
+    section = scenario.phantom
+    return rescatter(
+        image, scenario.probe.probe(), display=section.display(), angles=section.angles, seed=section.seed
+    )
 
 
 def _tell(report: dict[str, Any], out: Path) -> None:

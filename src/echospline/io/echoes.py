@@ -1,0 +1,134 @@
+"""``echoes.npz``: complex baseband frames beside their grid and carrier, written frame by frame, read checked."""
+
+from __future__ import annotations
+
+import zipfile
+from math import prod
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Self
+
+import numpy as np
+
+from echospline.echo import Echo, EchoCine
+from echospline.errors import InputError
+from echospline.grid import RegularGrid
+from echospline.io.part import give_name, part_of, writing
+from echospline.io.recording import LIMIT, MIB, decoding
+
+KEYS = ("iq", "times", "spacing", "origin", "carrier")
+
+
+class EchoWriter:
+    """Writes a known number of frames to ``echoes.npz``; holds one at a time.
+
+    The file is called ``NAME.part`` until it is whole.
+
+    Parameters
+    ----------
+    path : Path
+        Ends in ``.npz``.
+    frames : int
+        How many will come.
+    grid : RegularGrid
+        Of the samples.
+    carrier : float
+        Cycles per mm.
+    """
+
+    def __init__(self, path: str | Path, frames: int, grid: RegularGrid, carrier: float) -> None:
+        self.path = Path(path)
+        if self.path.suffix.lower() != ".npz" or frames < 1:
+            raise InputError(f"echoes are written as .npz, one frame or more; got {self.path.name}, {frames}")
+        self._frames, self._grid, self._carrier = frames, grid, carrier
+        self._times: list[float] = []
+        with writing(self.path):
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._zip = zipfile.ZipFile(part_of(self.path), "w", zipfile.ZIP_STORED, allowZip64=True)
+            self._member: IO[bytes] = self._zip.open("iq.npy", "w", force_zip64=True)
+            np.lib.format.write_array_header_1_0(
+                self._member, {"descr": "<c8", "fortran_order": False, "shape": (frames, *grid.shape[::-1])}
+            )
+
+    def add(self, echo: Echo, time: float) -> None:
+        """Write one frame; time in s."""
+        if echo.grid != self._grid or echo.carrier != self._carrier or len(self._times) >= self._frames:
+            raise InputError(f"{self.path.name} takes {self._frames} frames of one grid and carrier")
+        with writing(self.path):
+            self._member.write(np.ascontiguousarray(echo.iq, dtype="<c8").tobytes())
+        self._times.append(time)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with writing(self.path):
+            self._member.close()
+            if kind is None and len(self._times) == self._frames:
+                for name, value in (
+                    ("times", self._times), ("spacing", self._grid.spacing), ("origin", self._grid.origin),
+                    ("carrier", self._carrier),
+                ):  # fmt: skip
+                    with self._zip.open(f"{name}.npy", "w") as member:
+                        np.lib.format.write_array(member, np.asarray(value, dtype="<f8"), allow_pickle=False)
+            self._zip.close()
+            if kind is None:
+                if len(self._times) != self._frames:
+                    raise InputError(f"{self.path.name} got {len(self._times)} of {self._frames} frames")
+                give_name(part_of(self.path), self.path)
+
+
+def read_echoes(path: str | Path, *, limit: float = LIMIT) -> EchoCine:
+    """Read ``echoes.npz``; nothing is unpickled, nothing is allocated before its size is known.
+
+    Parameters
+    ----------
+    path : str or Path
+    limit : float
+        MiB that the frames may fill.
+
+    Raises
+    ------
+    InputError
+        If the file is no such record, damaged or too large.
+    """
+    path = Path(path)
+    with decoding(path, "echoes.npz"), zipfile.ZipFile(path) as archive:
+        missing = [k for k in KEYS if f"{k}.npy" not in archive.namelist()]
+        if missing:
+            raise InputError(
+                f"{path} lacks {', '.join(missing)}; expected an echoes.npz with {', '.join(KEYS)}"
+            )
+        arrays = {}
+        for name in KEYS:
+            info = archive.getinfo(f"{name}.npy")
+            with archive.open(info) as member:
+                np.lib.format.read_magic(member)
+                shape, fortran, dtype = np.lib.format.read_array_header_1_0(member, max_header_size=4096)
+                kind = "c" if name == "iq" else "f"
+                held = info.file_size - member.tell()
+                if fortran or dtype.kind != kind or prod(shape) * dtype.itemsize != held:
+                    raise InputError(
+                        f"{path}: {name} declares shape {shape} of {dtype} but holds {held} bytes"
+                    )
+                if held / MIB > limit or (name != "iq" and held > 8 * 10_000_000):
+                    raise InputError(
+                        f"{path}: {name} fills {held / MIB:,.0f} MiB, more than the limit of {limit:,.0f} MiB: raise it"
+                    )
+                arrays[name] = np.frombuffer(member.read(held), dtype=dtype).reshape(shape)
+    if (
+        arrays["iq"].ndim != 3
+        or arrays["spacing"].shape != (2,)
+        or arrays["origin"].shape != (2,)
+        or arrays["carrier"].shape != ()
+    ):
+        raise InputError(
+            f"{path}: echoes have iq (frames, rows, lines), spacing (2,), origin (2,), one carrier"
+        )
+    rows, lines = arrays["iq"].shape[1:]
+    (dx, dy), (x0, y0) = arrays["spacing"].tolist(), arrays["origin"].tolist()
+    grid = RegularGrid((lines, rows), (dx, dy), (x0, y0))
+    times = np.asarray(arrays["times"], dtype=np.float64)
+    return EchoCine(arrays["iq"], times, grid, float(arrays["carrier"]))
