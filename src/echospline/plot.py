@@ -10,6 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patheffects import Normal, Stroke
+from numpy.typing import NDArray
 
 from echospline.errors import InputError
 from echospline.grid import Floats, RegularGrid
@@ -115,6 +116,92 @@ def draw_summary(
     rest.set_xlim(left, right)
     rest.set_ylim(bottom, top)
     return figure
+
+
+def tracking_figure(
+    grey: NDArray[np.uint8],
+    grid: RegularGrid,
+    points: Floats,
+    displacement: Floats,
+    confidence: Floats,
+    path: str | Path,
+    *,
+    pose: NeedlePose | None = None,
+    title: str = "",
+) -> None:
+    """Draw tracked motion: arrows over the first picture, the axial displacement, the confidence.
+
+    Parameters
+    ----------
+    grey : ndarray, shape (rows, columns)
+        The first frame.
+    grid : RegularGrid
+        Its pixel centres, mm.
+    points, displacement, confidence : ndarray, shapes (n, 2), (n, 2), (n,)
+        Tracked points, mm; arrows are drawn where the confidence is 0.3 or more.
+    path : str or Path
+        ``.png``, ``.svg`` or ``.pdf``.
+    pose : NeedlePose, optional
+        The needle.
+    title : str
+        One line above all.
+    """
+    left, right, top, bottom = _edges(grid)
+    height = 4.4 * min(max((bottom - top) / (right - left), 0.4), 1.6)
+    figure = Figure(figsize=(15.0, height + 1.35), layout="constrained")
+    figure.suptitle(title, fontsize=13)
+    arrows, axial, trust = figure.subplots(1, 3, sharex=True, sharey=True)
+    _draw_image(arrows, UltrasoundImage(grey, grid), "Tracked displacement", (0.0, 255.0))
+    trusted = confidence >= 0.3
+    thin = np.zeros(len(points), dtype=bool)
+    thin[_spread(points, (right - left) / 24.0)] = True
+    p, u = points[thin & trusted], displacement[thin & trusted]
+    largest = float(np.hypot(*displacement[trusted].T).max(initial=0.0))
+    # the longest arrow takes a tenth of the width
+    scale = 0.1 * (right - left) / largest if largest > _MOVED else 1.0
+    arrows.quiver(
+        p[:, 0], p[:, 1], scale * u[:, 0], scale * u[:, 1],
+        angles="xy", scale_units="xy", scale=1.0, color="gold", width=0.003,
+    )  # fmt: skip
+    arrows.set_xlabel(f"lateral, mm; arrows {scale:.1f} times as long as the motion")
+    arrows.set_ylabel("depth, mm")
+    bound = max(float(np.abs(displacement[trusted, 1]).max(initial=0.0)), _MOVED)
+    for axes, values, name, colours, low, high in (
+        (
+            axial,
+            np.where(trusted, displacement[:, 1], np.nan),
+            "axial displacement, mm",
+            "RdBu_r",
+            -bound,
+            bound,
+        ),
+        (trust, confidence, "confidence", "viridis", 0.0, 1.0),
+    ):
+        drawn = axes.scatter(
+            points[:, 0],
+            points[:, 1],
+            c=values,
+            s=6,
+            marker="s",
+            cmap=colours,
+            vmin=low,
+            vmax=high,
+            linewidths=0,
+        )
+        figure.colorbar(drawn, ax=axes, label=name)
+        axes.set(aspect="equal", title=name.split(",", maxsplit=1)[0].capitalize(), xlabel="lateral, mm")
+    if pose is not None and pose.depth > 0:
+        for axes in (arrows, axial, trust):
+            _draw_needle(axes, pose, 1.2)
+    arrows.set_xlim(left, right)
+    arrows.set_ylim(bottom, top)
+    save(figure, path)
+
+
+def _spread(points: Floats, step: float) -> NDArray[np.intp]:
+    """Indices of points of which one lies in every square of side ``step``."""
+    cells = np.floor(points / step).astype(int)
+    return np.unique(cells, axis=0, return_index=True)[1]
 
 
 def save(figure: Figure, path: str | Path, *, dpi: int = 130) -> None:

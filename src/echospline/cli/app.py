@@ -14,6 +14,7 @@ from echospline.cli.phantom import phantom
 from echospline.cli.sessions import sessions
 from echospline.cli.simulate import demo, simulate
 from echospline.cli.study import study
+from echospline.cli.track import track
 from echospline.errors import EchosplineError
 
 app = typer.Typer(
@@ -35,6 +36,7 @@ app.command()(live)
 app.add_typer(sessions, name="sessions")
 app.command()(link)
 app.command()(phantom)
+app.command()(track)
 
 
 def main() -> None:

@@ -1,0 +1,231 @@
+"""``echospline track``: speckle tracking of a recorded or synthetic cine."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import track as counted
+
+from echospline.block_matching import BlockMatching
+from echospline.echo import Echo, EchoCine
+from echospline.errors import InputError
+from echospline.grid import Floats, RegularGrid
+from echospline.image import Cine
+from echospline.io import read
+from echospline.io.echoes import read_echoes
+from echospline.io.kind import head
+from echospline.io.needle_path import read_needle
+from echospline.io.tracks import write_track
+from echospline.needle import NeedlePose
+from echospline.region import grid_over, inside_ahead, region_ahead
+from echospline.tracking import FlowTracker, Reference, Track, Tracker, grey_pair
+from echospline.tracking import track as follow
+
+
+def track(
+    cine: Annotated[
+        str,
+        typer.Argument(metavar="CINE", help="echoes.npz of a phantom, or a cine of any readable format"),
+    ],
+    out: Annotated[Path, typer.Option("--out", help="FIELD: .npz or .mha")] = Path("out/track.npz"),
+    spacing: Annotated[
+        str | None, typer.Option(metavar="LAT,DEPTH", help="mm per pixel, where the file does not say")
+    ] = None,
+    fps: Annotated[
+        float | None, typer.Option(metavar="N", help="frames per second, where the file does not say")
+    ] = None,
+    crop: Annotated[
+        str | None, typer.Option(metavar="L,T,R,B", help="pixels to keep: rulers and letters are not tissue")
+    ] = None,
+    rf: Annotated[
+        float | None,
+        typer.Option("--rf", metavar="MHZ", help="the cine holds RF lines of this centre frequency"),
+    ] = None,
+    sound_speed: Annotated[float, typer.Option(metavar="MM_US", help="with --rf: mm/us")] = 1.54,
+    grid: Annotated[float, typer.Option(metavar="MM", help="distance of the tracked points")] = 0.5,
+    roi: Annotated[
+        str | None, typer.Option(metavar="X0,Y0,X1,Y1", help="track inside this box only, mm")
+    ] = None,
+    needle: Annotated[
+        Path | None,
+        typer.Option(
+            help="path of the needle, which is masked: CSV (time_s,entry_x_mm,...) or displacement.npz"
+        ),
+    ] = None,
+    ahead: Annotated[
+        float | None,
+        typer.Option(
+            metavar="MM", help="with --needle: a region of 2 x 3 mm whose centre is so far ahead of the tip"
+        ),
+    ] = None,
+    mask: Annotated[float, typer.Option(metavar="MM", help="half width of the masked needle")] = 1.0,
+    method: Annotated[
+        str, typer.Option(help="flow (dense flow, carrier phase with echoes) or block")
+    ] = "flow",
+    reference: Annotated[
+        str, typer.Option(help="keyframe (few links, little drift), first or previous")
+    ] = "keyframe",
+    step: Annotated[float, typer.Option(metavar="MM", help="largest motion per link of keyframe")] = 0.6,
+    preview: Annotated[
+        Path | None, typer.Option(metavar="PNG", help="picture with arrows; beside FIELD where not given")
+    ] = None,
+    json_: Annotated[bool, typer.Option("--json", help="print the report as JSON, nothing else")] = False,
+) -> None:
+    """Track the motion of tissue through a cine.
+
+    Writes points, displacement against the first frame (lateral and axial, mm), the needle and a confidence per point
+    and frame (0 to 1); `identify` reads it. Points that lost their speckle take their neighbours' motion, and their
+    confidence says so.
+    """
+    began = perf_counter()
+    frames = load(cine, spacing=spacing, fps=fps, crop=crop, rf=rf, sound_speed=sound_speed)
+    path = None if needle is None else read_needle(needle)
+    poses = None if path is None else [path.pose(t) for t in frames.times]
+    if ahead is not None and poses is None:
+        raise InputError("--ahead needs --needle: the region travels before its tip")
+    if ahead is not None and out.suffix.lower() == ".mha":
+        raise InputError("--ahead tracks scattered points, which .mha cannot hold: write .npz")
+    box = None if roi is None else numbers(roi, 4, "--roi")
+    points = (
+        grid_over(frames.grid.extent, grid, box).nodes
+        if ahead is None
+        else swept(poses or [], ahead, frames.grid)
+    )
+    wrap: Any = (
+        iter
+        if json_
+        else lambda it: counted(list(it), "tracking", console=Console(stderr=True), transient=True)
+    )
+    found = follow(
+        frames,
+        points,
+        tracker(method),
+        reference=named_reference(reference),
+        step=step,
+        needle=poses,
+        needle_radius=mask,
+        progress=wrap,
+    )
+    if ahead is not None and poses is not None:
+        # outside of the region of its frame a point is not asked for
+        here = np.stack([inside_ahead(points, pose, ahead) for pose in poses])
+        found = Track(found.points, found.times, found.displacement, found.confidence * here, found.keyframes)
+    write_track(out, found, poses)
+    report = summary(found, perf_counter() - began)
+    picture = preview or out.with_suffix(".png")
+    draw(frames, found, poses, picture)
+    if json_:
+        json.dump(report | {"files": [str(out), str(picture)]}, sys.stdout, indent=1)
+        print()
+        return
+    Console().print(
+        f"{report['points']} points in {report['frames']} frames in {report['seconds']:.1f} s, {report['keyframes']} keyframes; "
+        f"largest trusted motion {report['largest_mm']:.3f} mm, {report['trusted']:.0%} trusted; wrote {out} and {picture}"
+    )
+
+
+def load(
+    cine: str,
+    *,
+    spacing: str | None = None,
+    fps: float | None = None,
+    crop: str | None = None,
+    rf: float | None = None,
+    sound_speed: float = 1.54,
+) -> Cine | EchoCine:
+    """Read a cine of pictures or of echoes."""
+    if not cine.startswith("sample:") and Path(cine).is_file() and head(Path(cine)).startswith(b"PK"):
+        return read_echoes(cine)
+    found = read(
+        cine,
+        spacing=None if spacing is None else numbers(spacing, 2, "--spacing"),
+        fps=fps,
+        region=None if crop is None else [int(v) for v in numbers(crop, 4, "--crop")],
+    )
+    if not isinstance(found, Cine) or len(found) < 2:
+        raise InputError(f"{cine} holds one image; tracking needs a cine of two frames or more")
+    if rf is None:
+        return found
+    carrier = 2.0 * rf / sound_speed
+    iq = np.stack([Echo.from_rf(f, found.grid, carrier).iq for f in found.frames])
+    level = float(np.sqrt(np.mean(np.abs(iq[0]) ** 2)))
+    return EchoCine(iq / max(level, 1e-30), found.times, found.grid, carrier)
+
+
+def tracker(method: str) -> Tracker:
+    """Return the method of that name."""
+    known: dict[str, Tracker] = {"flow": FlowTracker(), "block": BlockMatching()}
+    if method not in known:
+        raise InputError(f"--method is flow or block; got {method!r}")
+    return known[method]
+
+
+def named_reference(reference: str) -> Reference:
+    """Check the name of a reference."""
+    names: dict[str, Literal["keyframe", "first", "previous"]] = {
+        "keyframe": "keyframe",
+        "first": "first",
+        "previous": "previous",
+    }
+    if reference not in names:
+        raise InputError(f"--reference is keyframe, first or previous; got {reference!r}")
+    return names[reference]
+
+
+def numbers(text: str, count: int, option: str) -> list[float]:
+    """Read numbers between commas."""
+    try:
+        values = [float(v) for v in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != count:
+        raise InputError(f"{option} takes {count} numbers with commas between them; got {text!r}")
+    return values
+
+
+def swept(poses: Iterable[NeedlePose], distance: float, grid: RegularGrid) -> Floats:
+    """Points of the region ahead of the tip over all frames, on one lattice of 0.2 mm, inside the picture."""
+    found = [region_ahead(pose, distance) for pose in poses if pose.depth > 0]
+    points = np.concatenate(found) if found else np.empty((0, 2))
+    lattice = np.unique(np.rint(points / 0.2).astype(int), axis=0) * 0.2
+    lattice = lattice[grid.contains(lattice)]
+    if len(lattice) == 0:
+        raise InputError(f"the region {distance:g} mm ahead of the tip never lies inside the picture")
+    return np.asarray(lattice, dtype=np.float64)
+
+
+def summary(found: Track, seconds: float) -> dict[str, Any]:
+    """Say what was found."""
+    trusted = found.confidence >= 0.3
+    size = np.hypot(found.displacement[..., 0], found.displacement[..., 1])
+    return {
+        "frames": len(found.times),
+        "points": len(found.points),
+        "keyframes": len(found.keyframes),
+        "trusted": float(trusted.mean()),
+        "trusted_last_frame": float(trusted[-1].mean()),
+        "largest_mm": float(size[trusted].max(initial=0.0)),
+        "seconds": round(seconds, 3),
+    }
+
+
+def draw(frames: Cine | EchoCine, found: Track, poses: list[NeedlePose] | None, path: Path) -> None:
+    """Draw the arrows of the frame that moved most over the first picture."""
+    # matplotlib takes long to load
+    from echospline.plot import tracking_figure  # noqa: PLC0415
+
+    grey, _, grid = grey_pair(frames[0], frames[0])
+    size = np.hypot(found.displacement[..., 0], found.displacement[..., 1]) * (found.confidence >= 0.3)
+    k = int(size.max(axis=1).argmax())
+    tracking_figure(
+        grey, grid, found.points, found.displacement[k], found.confidence[k], path,
+        pose=None if poses is None else poses[k], title=f"{found.times[k]:.2f} s",
+    )  # fmt: skip

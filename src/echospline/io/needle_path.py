@@ -1,0 +1,57 @@
+"""A needle's path on disk: CSV rows of time, entry and tip, or the needle inside of a ``displacement.npz``."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from echospline.errors import InputError
+from echospline.io.displacement import read_displacement
+from echospline.io.kind import head
+from echospline.needle import Insertion
+
+COLUMNS = ("time_s", "entry_x_mm", "entry_y_mm", "tip_x_mm", "tip_y_mm")
+LARGEST = 50_000_000
+"""Bytes of a CSV file."""
+
+
+def read_needle(path: str | Path) -> Insertion:
+    """Read a needle's path.
+
+    Parameters
+    ----------
+    path : str or Path
+        CSV with the header ``time_s,entry_x_mm,entry_y_mm,tip_x_mm,tip_y_mm`` and ascending times, in the cine's own
+        coordinates; or a ``displacement.npz``.
+
+    Raises
+    ------
+    InputError
+        If the file is neither, or its numbers make no path.
+    """
+    path = Path(path)
+    if head(path).startswith(b"PK"):
+        record = read_displacement(path)
+        return Insertion(record.times, record.entry, record.tip)
+    if path.stat().st_size > LARGEST:
+        raise InputError(
+            f"{path} has {path.stat().st_size} bytes; a needle's path is a CSV file of few lines"
+        )
+    try:
+        rows = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"cannot read the needle's path {path}: {error}") from error
+    rows = [r for r in rows if r and not r[0].lstrip().startswith("#")]
+    if not rows or tuple(c.strip() for c in rows[0]) != COLUMNS:
+        raise InputError(
+            f"{path}: the first line must be {','.join(COLUMNS)}; got {','.join(rows[0]) if rows else ''}"
+        )
+    try:
+        values = np.array([[float(v) for v in row] for row in rows[1:]], dtype=np.float64)
+    except ValueError as error:
+        raise InputError(f"{path}: every line holds five numbers: {error}") from error
+    if values.ndim != 2 or values.shape[1] != len(COLUMNS):
+        raise InputError(f"{path}: every line holds five numbers, and there are two lines or more")
+    return Insertion(values[:, 0], values[:, 1:3], values[:, 3:5])
