@@ -143,7 +143,7 @@ def scene_of(scenario: Scenario, image: UltrasoundImage, folder: Path) -> Scene:
         update={"image": scenario.image.model_copy(update={"file": _whole(scenario, folder)})}
     )
     return Scene(
-        title=scenario.title or Path(scenario.image.file.removeprefix("sample:")).stem,
+        title=scenario.title or scenario.image.file.replace("sample:", "Sample: ").rsplit("/", 1)[-1],
         image=image,
         grid=grid,
         models=lambda kind: build_model(scenario, grid, kind=kind, folder=folder),

@@ -27,6 +27,8 @@ IN_FLIGHT = 2
 """Frames sent and not yet drawn; with two, one is on its way while the other is drawn."""
 PLOT_POINTS = 400
 """Points of the summary's plot."""
+STILL, KEEP_ALIVE = 5e-4, 0.1
+"""mm and s: while nothing moves further than that from the picture shown, frames come only this often."""
 HISTORY = 50
 """Earlier sessions of the same exercise in the summary."""
 
@@ -235,11 +237,14 @@ class Client:
     # --- to the page
 
     async def _send_frames(self) -> None:
-        number = 0
+        number, shown, shown_at = 0, None, 0.0
+        loop = asyncio.get_running_loop()
         while True:
             await self._credit.wait()
-            newest = await self._newer_than(number)
-            number, snapshot = newest
+            number, snapshot = await self._newer_than(number)
+            if shown is not None and loop.time() - shown_at < KEEP_ALIVE and is_still(shown, snapshot):
+                continue
+            shown, shown_at = snapshot, loop.time()
             if snapshot.failure != self._failure:
                 self._failure = snapshot.failure
                 if snapshot.failure is not None:
@@ -289,6 +294,17 @@ class Client:
             code, reason = 1011, "the server has a fault; its log says more"
         if self.socket.application_state is WebSocketState.CONNECTED:
             await self.socket.close(code, reason.encode()[:120].decode("utf-8", "ignore"))
+
+
+def is_still(shown: Snapshot, now: Snapshot) -> bool:
+    """Whether a frame of ``now`` would look like that of ``shown``: same needle, tissue within `STILL` mm."""
+    same = shown.pose == now.pose and shown.command == now.command and shown.model == now.model
+    flags = (shown.frozen, shown.replaying, shown.failure) == (now.frozen, now.replaying, now.failure)
+    if not (same and flags and len(shown.watched) == len(now.watched)):
+        return False
+    if (shown.reference is None) != (now.reference is None):
+        return False
+    return float(np.abs(shown.displacement - now.displacement).max(initial=0.0)) < STILL
 
 
 def resampled(trace: Trace, period: float) -> list[NeedlePose]:

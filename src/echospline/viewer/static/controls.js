@@ -242,7 +242,7 @@ export class Controls {
 /** @type {Record<string, string>} */
 export const ACTIONS = {
   " ": "reset", c: "freeze", i: "invert", "+": "zoom-in", "=": "zoom-in", "-": "zoom-out", 0: "fit",
-  m: "mesh", a: "arrows", t: "heat", g: "guide", 1: "model-0", 2: "model-1", 3: "model-2", k: "compare",
+  m: "mesh", a: "arrows", t: "heat", g: "guide", 1: "model-0", 2: "model-1", 3: "model-2", 4: "model-3", k: "compare",
   e: "exercise", x: "abandon", n: "next-exercise", "?": "help", l: "sessions",
 };
 /** @type {Record<number, string>} */

@@ -206,7 +206,7 @@ export class Training {
     const name = /** @type {HTMLSelectElement} */ (byId("progress-of")).value;
     const past = this.stored.filter((session) => session.exercise === name && session.score.final_error !== null).reverse();
     drawChart(/** @type {HTMLCanvasElement} */ (byId("progress-plot")), {
-      lines: [{ label: "tip to target, mm", colour: "#5fd4e0", x: past.map((_, k) => k + 1), y: past.map((s) => s.score.final_error), dots: true }],
+      lines: [{ label: "tip to target", colour: "#5fd4e0", x: past.map((_, k) => k + 1), y: past.map((s) => s.score.final_error), dots: true }],
       xLabel: "session", counted: true, yLabel: "mm",
     });
   }
@@ -237,6 +237,7 @@ function why(score, exercise) {
 
 /** @param {number} value */
 export function number(value) {
+  if (Math.abs(value) < 0.005) return "0";
   return Number.isInteger(value) ? String(value) : value.toFixed(Math.abs(value) < 10 ? 2 : Math.abs(value) < 1000 ? 1 : 0);
 }
 

@@ -340,7 +340,8 @@ function readouts(f) {
 function slowReadouts() {
   const now = performance.now();
   drawTimes = drawTimes.filter((t) => now - t < 1000);
-  put("fps", String(drawTimes.length));
+  const idle = frame !== null && frame.speed === 0 && drawTimes.length <= 14; // the server sends ten a second then
+  put("fps", idle ? "at rest" : `${drawTimes.length} frames/s`);
   if (frame) put("step", frame.duration.toFixed(2));
   if (latencies.length) {
     latencies.sort((a, b) => a - b);
