@@ -1,0 +1,156 @@
+"""`echospline live` and `echospline sessions` as a person runs them."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from echospline.cli.app import app
+from echospline.cli.live import opener_for, scene_of
+from echospline.cli.options import scenario_from
+from echospline.cli.sessions import keyframes
+from echospline.errors import InputError
+from echospline.io.displacement import read_displacement
+from echospline.models import MODELS
+from echospline.needle import Insertion
+from echospline.viewer.protocol import SPLINE
+from echospline.viewer.scoring import Trace, score
+from echospline.viewer.sessions import Sessions
+from test_viewer_server import page
+
+PERIOD = 1 / 120
+
+
+def small_scene(**changes):
+    scenario, folder = scenario_from("sample:calf", {"mesh.nodes": "12x9", **changes})
+    return scene_of(scenario, scenario.read_image(folder), folder), scenario
+
+
+def invoke(*arguments):
+    result = CliRunner().invoke(app, [str(a) for a in arguments])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result
+
+
+@pytest.fixture
+def kept(tmp_path):
+    """A file with one session of a needle that goes 6 mm into the calf."""
+    scene, _ = small_scene(**{"output.formats": "mha", "output.figure": False, "output.fps": "20"})
+    exercise = scene.exercises[0]
+    path = Insertion.straight((10.0, 0.0), 50.0, 6.0, 20.0)
+    poses = [path.pose(PERIOD * k) for k in range(1, round(path.duration / PERIOD) + 1)]
+    rows = np.array([(*p.entry, *p.tip, p.speed) for p in poses])
+    trace = Trace(PERIOD, rows, np.repeat(np.array([exercise.landmarks]), len(rows), axis=0))
+    sessions = Sessions(tmp_path / "kept.sqlite")
+    sessions.add(
+        exercise,
+        trace,
+        score(trace, exercise),
+        trainee="Cy",
+        scene=scene.title,
+        model="fem",
+        source=scene.source,
+    )
+    return sessions.path, trace
+
+
+def test_live_serves_the_page_and_the_real_model_and_ends_when_told(tmp_path):
+    command = [sys.executable, "-m", "echospline", "live", "--no-browser", "--port", "0", "--mesh", "12x9",
+               "--sessions", str(tmp_path / "deep" / "kept.sqlite")]  # fmt: skip
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            address = re.search(r"http://\S+", process.stderr.readline()).group().rstrip("/")
+            with page(address) as client:
+                assert [m["name"] for m in client.hello["scene"]["models"]] == list(MODELS)
+                entry = tuple(client.hello["pose"]["entry"])
+                frame = client.until(lambda f: f.largest > 0.2, (*entry, 50.0, 8.0), timeout=30)
+                assert frame.flags & SPLINE  # landmarks and weights, not nodes
+                client.ask(do="model", name="fem")
+                frame = client.until(lambda f: not f.flags & SPLINE, timeout=30)
+                assert frame.displacement.shape == (12 * 9, 2)
+                assert frame.largest > 0.2
+        finally:
+            process.send_signal(signal.SIGINT)
+            assert process.wait(20) == 0
+        assert "Traceback" not in process.stderr.read()
+    assert (tmp_path / "deep" / "kept.sqlite").exists()
+
+
+def test_every_model_can_be_steered_in_a_scene():
+    scene, _ = small_scene()
+    for name, _ in scene.names:
+        model = scene.models(name)
+        state = model.rest()
+        for k in range(1, 5):
+            state = model.advance(
+                state, Insertion.straight((10.0, 0.0), 50.0, 4.0, 20.0).pose(k / 20), 1 / 20
+            )
+        assert np.abs(model.displacement(state)).max() > 0.05, name
+
+
+def test_a_needle_outside_the_image_is_refused():
+    with pytest.raises(InputError, match=r"needle\.entry must lie in the image"):
+        small_scene(**{"needle.entry": "500,0"})
+
+
+def test_an_uploaded_picture_becomes_a_scene(tmp_path):
+    _, scenario = small_scene()
+    picture = tmp_path / "a.png"
+    from PIL import Image  # noqa: PLC0415
+
+    Image.fromarray(np.full((50, 80), 90, np.uint8)).save(picture)
+    opened = opener_for(scenario)(picture, (0.5, 0.5))
+    assert opened.grid.extent == pytest.approx((0.0, 39.5, 0.0, 24.5))
+    assert opened.grid.contains(opened.entry).all()
+    with pytest.raises(InputError, match="spacing"):
+        opener_for(scenario)(picture, None)
+
+
+def test_sessions_are_listed_exported_and_scored_again(kept, tmp_path):
+    path, trace = kept
+    assert "Cy" in invoke("sessions", "list", "--sessions", path).output
+    (listed,) = json.loads(invoke("sessions", "list", "--sessions", path, "--json").output)
+    assert listed["model"] == "fem"
+    out = tmp_path / "all.csv"
+    invoke("sessions", "export", out, "--sessions", path)
+    assert len(list(csv.reader(out.open()))) == 2
+    invoke("sessions", "export", out, "--session", 1, "--sessions", path)
+    assert len(list(csv.reader(out.open()))) == 1 + len(trace)
+    both = json.loads(invoke("sessions", "rescore", 1, "--sessions", path).output)
+    assert both["stored"] == both["now"]
+
+
+def test_a_session_becomes_a_cine_with_its_true_motion(kept, tmp_path):
+    path, trace = kept
+    invoke("sessions", "cine", 1, "--out", tmp_path / "out", "--sessions", path)
+    record = read_displacement(tmp_path / "out" / "displacement.npz")
+    assert (tmp_path / "out" / "cine.mha").exists()
+    assert record.times[-1] > 0.7 * trace.times[-1]
+    for axis in (0, 1):
+        exact = np.interp(record.times + trace.times[0], trace.times, trace.tip[:, axis])
+        np.testing.assert_allclose(record.tip[:, axis], exact, atol=1e-6)
+    assert np.abs(record.displacement[-1]).max() > 0.1
+
+
+def test_keyframes_keep_the_path(kept):
+    _, trace = kept
+    rows = np.array(keyframes(trace))
+    assert len(rows) < 0.6 * len(trace)
+    for column, exact in ((3, trace.tip[:, 0]), (4, trace.tip[:, 1])):
+        np.testing.assert_allclose(
+            np.interp(trace.times - trace.times[0], rows[:, 0], rows[:, column]), exact, atol=1e-9
+        )
+
+
+def test_without_sessions_it_says_so(tmp_path):
+    with pytest.raises(InputError, match="no sessions"):
+        invoke("sessions", "list", "--sessions", tmp_path / "none.sqlite")
