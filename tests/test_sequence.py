@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import json
 import tracemalloc
 import zlib
 from contextlib import suppress
@@ -381,3 +382,51 @@ def test_simulate_writes_recordings_that_carry_the_needle(tmp_path: Path) -> Non
         np.testing.assert_allclose(insertion.entry[0], (10, 0), atol=1e-9)
         depth = np.hypot(*(insertion.tip - insertion.entry).T)
         np.testing.assert_allclose(depth, 12 * insertion.times, atol=1e-9)
+
+
+def test_a_recorded_procedure_is_simulated_again_and_compared(tmp_path: Path) -> None:
+    words = ["--mesh", "16x12", "--needle-frame", "NeedleTip"]
+    tissue = [
+        "--mesh",
+        "16x12",
+        "--entry",
+        "10,0",
+        "--angle",
+        "60",
+        "--depth",
+        "12",
+        "--speed",
+        "12",
+        "--dwell",
+        "0",
+    ]
+    extra = [
+        "--no-retract",
+        "--fps",
+        "10",
+        "--formats",
+        "igs.mha",
+        "--no-figure",
+        "--no-displacement",
+        "--json",
+    ]
+    first = CliRunner().invoke(app, ["simulate", "sample:calf", "--out", str(tmp_path), *tissue, *extra])
+    assert first.exit_code == 0
+    recording = str(tmp_path / "run.igs.mha")
+    answer = CliRunner().invoke(
+        app, ["recorded", recording, "--out", str(tmp_path / "again"), *words, "--json"]
+    )
+    assert answer.exit_code == 0
+    told = json.loads(answer.output)
+    assert told["frames"] == 11
+    assert told["deepest_mm"] == pytest.approx(12)
+    assert told["median_correlation_simulated"] > 0.999  # the very run comes out again
+    assert told["median_correlation_still"] < 0.9
+    np.testing.assert_allclose(
+        read_sequence(tmp_path / "again" / "resimulated.igs.mha").insertion().tip,
+        read_sequence(recording).insertion().tip,
+        atol=1e-9,
+    )
+    lines = (tmp_path / "again" / "comparison.csv").read_text().splitlines()
+    assert lines[0].startswith("time_s,tip_x_mm,tip_y_mm,depth_mm,correlation_simulated")
+    assert len(lines) == 12

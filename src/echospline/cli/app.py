@@ -11,6 +11,7 @@ from echospline.cli.info import info
 from echospline.cli.link import link
 from echospline.cli.live import live
 from echospline.cli.phantom import phantom
+from echospline.cli.recorded import recorded
 from echospline.cli.sessions import sessions
 from echospline.cli.simulate import demo, simulate
 from echospline.cli.study import study
@@ -35,6 +36,7 @@ app.command()(study)
 app.command()(live)
 app.add_typer(sessions, name="sessions")
 app.command()(link)
+app.command()(recorded)
 app.command()(phantom)
 app.command()(track)
 

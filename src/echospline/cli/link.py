@@ -140,7 +140,7 @@ def link(
         needles=tuple(needle_frame) if needle_frame else ("NeedleTip", "StylusTip"),
         reference=reference,
         image=image_name,
-        axis=_axis(needle_axis),
+        axis=axis_of(needle_axis),
         calibration=read_calibration(config) if config else {},
     )
     options = SessionOptions(
@@ -258,7 +258,14 @@ def _point(text: str) -> tuple[float, float]:
     return x, y
 
 
-def _axis(text: str) -> tuple[float, float, float]:
+def axis_of(text: str) -> tuple[float, float, float]:
+    """Unit vector of ``x``, ``-x``, ... ``-z``.
+
+    Raises
+    ------
+    InputError
+        If the text is another.
+    """
     if text not in AXES:
         raise InputError(f"--needle-axis is one of {', '.join(AXES)}; got {text!r}")
     return AXES[text]

@@ -1,0 +1,126 @@
+"""``echospline recorded``: a tracked procedure, simulated again and compared with what was seen."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from threadpoolctl import threadpool_limits
+
+from echospline.cli.link import axis_of
+from echospline.cli.options import scenario_from, with_scenario_options
+from echospline.errors import InputError
+from echospline.image import Pixels
+from echospline.io.part import part_of, writing
+from echospline.models import build_model
+from echospline.openigtlink.plus import read_calibration
+from echospline.sequence import SequenceWriter, read_sequence
+from echospline.simulate import simulate
+
+
+@with_scenario_options
+def recorded(
+    file: Annotated[
+        Path,
+        typer.Argument(metavar="RECORDING", help="NAME.igs.mha of PLUS, or NAME.seq.nrrd of PLUS or Slicer"),
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", help="folder for the results, made where it is not there")
+    ] = Path("out"),
+    needle_frame: Annotated[
+        str, typer.Option(metavar="FRAME", help="frame at the needle's tip")
+    ] = "NeedleTip",
+    needle_axis: Annotated[
+        str, typer.Option(metavar="AXIS", help="direction of insertion in that frame: x, -x, y, -y, z, -z")
+    ] = "z",
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.xml", help="PLUS device set file with the calibration that the recording lacks"
+        ),
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="print the comparison as JSON, nothing else")
+    ] = False,
+    changes: dict[str, Any] | None = None,
+) -> None:
+    """Simulate a recorded procedure again and compare every picture with the recorded one.
+
+    The first good frame is the tissue at rest, the tracked transforms are the needle's path; model and mesh come from the
+    options. Writes `resimulated.igs.mha` and `comparison.csv`: for each frame the correlation of the recorded picture with
+    the simulated one, and with the first frame (what one gets by doing nothing).
+    """
+    scenario, folder = scenario_from(str(file), changes or {})
+    sequence = read_sequence(file)
+    spacing = scenario.image.spacing
+    cine, image = sequence.cine(spacing), sequence.image(spacing)
+    insertion = sequence.insertion(
+        needle_frame,
+        spacing=spacing,
+        axis=axis_of(needle_axis),
+        calibration=read_calibration(config) if config else None,
+    )
+    model = build_model(scenario, scenario.grid(image), folder=folder)
+    span = float(insertion.times[-1] - insertion.times[0])
+    fps = max(1.0, (len(insertion.times) - 1) / span)
+    rows: list[dict[str, float]] = []
+    with threadpool_limits(limits=1), SequenceWriter(out / "resimulated.igs.mha", image.grid) as writer:
+        for frame in simulate(image, insertion, model, fps=fps, needle=scenario.needle_echo()):
+            time = float(insertion.times[0]) + frame.time
+            seen = cine.frames[int(np.argmin(np.abs(cine.times - time)))]
+            writer.add(frame.image.pixels, time, frame.pose)
+            rows.append(
+                {
+                    "time_s": time,
+                    "tip_x_mm": frame.pose.tip[0],
+                    "tip_y_mm": frame.pose.tip[1],
+                    "depth_mm": frame.pose.depth,
+                    "correlation_simulated": correlation(frame.image.pixels, seen),
+                    "correlation_still": correlation(image.pixels, seen),
+                }
+            )
+    _write(out / "comparison.csv", rows)
+    told = {
+        "recording": file.name,
+        "frames": len(rows),
+        "duration_s": span,
+        "deepest_mm": max(row["depth_mm"] for row in rows),
+        "median_correlation_simulated": float(np.median([row["correlation_simulated"] for row in rows])),
+        "median_correlation_still": float(np.median([row["correlation_still"] for row in rows])),
+        "results": str(out),
+    }
+    if as_json:
+        print(json.dumps(told, indent=2))
+        return
+    print(
+        f"{told['frames']} frames in {span:.1f} s, needle down to {told['deepest_mm']:.1f} mm; median correlation with what was "
+        f"seen: simulated {told['median_correlation_simulated']:.3f}, first frame "
+        f"{told['median_correlation_still']:.3f}\nresults in {out}: resimulated.igs.mha, comparison.csv"
+    )
+
+
+def correlation(first: Pixels, second: Pixels) -> float:
+    """Normalised cross-correlation of two pictures, -1 to 1; 0 where one is uniform."""
+    a, b = first.astype(np.float64), second.astype(np.float64)
+    a, b = a - a.mean(), b - b.mean()
+    scale = float(np.sqrt((a * a).sum() * (b * b).sum()))
+    return float((a * b).sum() / scale) if scale > 0 else 0.0
+
+
+def _write(path: Path, rows: list[dict[str, float]]) -> None:
+    if not rows:
+        raise InputError("nothing was simulated")
+    text = io.StringIO()
+    table = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    table.writeheader()
+    table.writerows(rows)
+    part = part_of(path)
+    with writing(path):
+        part.write_text(text.getvalue(), encoding="ascii")
+        os.replace(part, path)
