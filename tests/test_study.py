@@ -19,7 +19,10 @@ from echospline.mechanics.landmark_stiffness import landmark_stiffness
 from echospline.mechanics.spline import factor
 from echospline.mechanics.tps import TPSModel
 from echospline.metrics import field_error
+from echospline.models import build_model
+from echospline.needle import Insertion
 from echospline.report import table, write_report
+from echospline.scenario import validated
 from echospline.speed import mesh_of, savings
 from echospline.study import Extent, study
 from echospline.tissue import Circle, Region, Tissue
@@ -192,3 +195,24 @@ def test_report_escapes_what_it_is_given(tmp_path):
 def test_too_small_a_grid_is_refused(tmp_path):
     with pytest.raises(InputError, match="8 runs or more"):
         brute_force(runs=3, frames=2, nodes=(9, 7))
+
+
+def test_a_scenario_with_a_stiff_region_holds_landmarks_back_there(tmp_path):
+    """The same needle into the middle of a lesion ten times as stiff displaces it less, by spline as by FEM."""
+    scene = validated({"mesh": {"nodes": [21, 16]}}, "test")
+    region = {"young": 100.0, "circle": {"centre": [20.0, 12.0], "radius": 5.0}}
+    with_lesion = scene.with_values({"tissue.region": [region]})
+    grid = RegularGrid((21, 16), (2.0, 2.0))
+    insertion = Insertion.straight((14.0, 0.0), 65.0, 13.0)
+    inside = Circle((20.0, 12.0), 5.0).contains(grid.nodes)
+    for kind in ("tps", "elastic", "fem"):
+        largest = []
+        for s in (scene, with_lesion):
+            model = build_model(s, grid, kind=kind)
+            state = model.rest()
+            for t in np.linspace(0.1, insertion.duration, 12):
+                state = model.advance(state, insertion.pose(t), 0.2)
+            largest.append(np.hypot(*model.displacement(state)[inside].T).max())
+        assert largest[1] < 0.8 * largest[0], kind
+    with pytest.raises(InputError, match="homogeneous"):
+        build_model(with_lesion, grid, kind="green")

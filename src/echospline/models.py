@@ -10,7 +10,9 @@ from echospline.grid import RegularGrid
 from echospline.mechanics.fem import FEMModel
 from echospline.mechanics.forces import NeedleForces
 from echospline.mechanics.green import GreenModel
-from echospline.mechanics.kernels import Elastic, ThinPlate
+from echospline.mechanics.kernels import Elastic, Kernel, ThinPlate
+from echospline.mechanics.landmark_stiffness import landmark_stiffness
+from echospline.mechanics.landmarks import Clamps
 from echospline.mechanics.model import TissueModel
 from echospline.mechanics.tps import TPSModel, TPSParameters
 from echospline.scenario import Scenario
@@ -49,11 +51,13 @@ def build_model(
         radius = scenario.model.green.radius
         return GreenModel(grid, clamped, tissue, forces, clamped_points=points, radius=radius)
     parameters = TPSParameters(**scenario.model.landmarks.model_dump())
-    if kind == "tps":
-        return TPSModel(grid, clamped, parameters, ThinPlate(), clamped_points=points)
+    kernel: Kernel = ThinPlate()
     if kind == "elastic":
         section = scenario.model.elastic
         nu = tissue.poisson if section.poisson is None else section.poisson
-        kernel = Elastic(min(nu, 0.499), section.radius, tissue.plane)
-        return TPSModel(grid, clamped, parameters, kernel, clamped_points=points)
+        kernel = Elastic(nu, section.radius, tissue.plane)
+    if kind in ("tps", "elastic"):
+        anchors = Clamps.of(grid, clamped, points).anchors(parameters.anchor_spacing)
+        stiffness = None if tissue.homogeneous else landmark_stiffness(tissue, grid, kernel, anchors)
+        return TPSModel(grid, clamped, parameters, kernel, clamped_points=points, stiffness=stiffness)
     raise InputError(f"a model is one of {', '.join(MODELS)}; got {kind!r}")

@@ -109,7 +109,7 @@ class Elastic:
     Parameters
     ----------
     nu : float
-        Poisson's ratio of the tissue, 0 <= nu < 0.5.
+        Poisson's ratio of the tissue, 0 <= nu <= 0.5, in plane strain below 0.5.
     radius : float
         Regularisation length, mm, positive.
     plane : {"stress", "strain"}
@@ -128,8 +128,11 @@ class Elastic:
     length_power: int = 0
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.nu < 0.5:
-            raise InputError(f"nu (Poisson's ratio) must lie in [0, 0.5); got {self.nu}")
+        if not (0.0 <= self.nu <= 0.5 if self.plane == "stress" else 0.0 <= self.nu < 0.5):
+            closing = "]" if self.plane == "stress" else ")"
+            raise InputError(
+                f"nu (Poisson's ratio) must lie in [0, 0.5{closing} in plane {self.plane}; got {self.nu}"
+            )
         if not (np.isfinite(self.radius) and self.radius > 0):
             raise InputError(
                 f"radius of the elastic kernel must be a positive number in mm; got {self.radius}"
