@@ -22,6 +22,9 @@ from echospline.mechanics.kernels import Kernel
 RESIDUAL = 1e-7
 """mm; largest misfit at the landmarks, relative to displacements of 1 mm, before a solution is refused."""
 
+FARTHEST = 1e9
+"""mm; a coordinate beyond a thousand kilometres is a mistake, and its square might overflow."""
+
 
 @dataclass(frozen=True)
 class Spline:
@@ -151,6 +154,8 @@ def factor(kernel: Kernel, landmarks: ArrayLike, stiffness: ArrayLike | None = N
     need = 3 if c == 1 else 2
     if m < need:
         raise InputError(f"a spline needs at least {need} landmarks; got {m}")
+    if np.abs(points).max() > FARTHEST:
+        raise InputError(f"landmarks must lie within {FARTHEST:g} mm; got one at {np.abs(points).max():g} mm")
     centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
     scale = float(np.ptp(points, axis=0).max()) / 2 or 1.0
     x = (points - centre) / scale
