@@ -8,6 +8,7 @@ import re
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ from echospline.viewer.sessions import Sessions
 from test_viewer_server import page
 
 PERIOD = 1 / 120
+EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 
 
 def small_scene(**changes):
@@ -154,3 +156,10 @@ def test_keyframes_keep_the_path(kept):
 def test_without_sessions_it_says_so(tmp_path):
     with pytest.raises(InputError, match="no sessions"):
         invoke("sessions", "list", "--sessions", tmp_path / "none.sqlite")
+
+
+def test_the_example_course_opens_with_its_exercises():
+    scenario, folder = scenario_from(str(EXAMPLES / "training.toml"), {"mesh.nodes": "12x9"})
+    opened = scene_of(scenario, scenario.read_image(folder), folder)
+    assert opened.title == "Calf: biopsy course"
+    assert [len(exercise.vessels) for exercise in opened.exercises] == [0, 0, 2]

@@ -439,7 +439,7 @@ def test_a_spline_drawn_from_its_weights_is_the_same_picture_as_from_its_nodes(l
     fine = RegularGrid.covering(MESH, (73, 55))  # the mesh that the page evaluates splines on
     looks = {"shaft": False, "tip": False, "reverberation": False, "shadow": False}
     nodes = encode_frame(snapshot(spline(fine.nodes)), 1)
-    weights = encode_frame(snapshot(np.zeros((MESH.size, 2)), offers_spline=True, spline=spline), 1)
+    weights = encode_frame(snapshot(np.zeros((MESH.size, 2)), spline=lambda: spline), 1)
     assert len(weights) < len(nodes) / 10
     from_nodes = rendered(live, nodes, fine, image, (160, 120), 4.0, looks)
     from_weights = rendered(live, weights, MESH, image, (160, 120), 4.0, looks)

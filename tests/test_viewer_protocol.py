@@ -82,7 +82,7 @@ def test_frames_have_the_golden_bytes():
     assert encode_frame(watched, 9) == plain
     reference = np.array([[0.0, 0.0], [0.0, 1.0]])
     assert encode_frame(replace(SNAPSHOT, reference=reference), 9) == compared
-    offered = replace(SNAPSHOT, offers_spline=True, spline=SPLINE)
+    offered = replace(SNAPSHOT, spline=lambda: SPLINE)
     sent = bytearray(encode_frame(offered, 9, recording=True))
     assert struct.unpack_from("<f", sent, FRAME_HEADER_BYTES + 4)[0] == pytest.approx(ELASTIC.coupling)
     struct.pack_into("<f", sent, FRAME_HEADER_BYTES + 4, 0.75)  # the golden file's coupling is a plain number
@@ -107,7 +107,7 @@ def test_a_spline_on_the_wire_is_the_same_field(kernel):
     rng = np.random.default_rng(2)
     landmarks = rng.uniform(0, 40, (30, 2))
     spline = factor(kernel, landmarks).solve(rng.normal(size=(30, 2)))
-    wire = decode_frame(encode_frame(replace(SNAPSHOT, offers_spline=True, spline=spline), 1)).spline
+    wire = decode_frame(encode_frame(replace(SNAPSHOT, spline=lambda: spline), 1)).spline
     head, rows = wire[:SPLINE_HEAD], wire[SPLINE_HEAD:].reshape(-1, 4)
     components, coupling, radius, cx, cy, scale, *m = head
     points = rng.uniform(0, 40, (50, 2))

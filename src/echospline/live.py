@@ -8,6 +8,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from math import exp, hypot, isfinite
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -141,11 +142,9 @@ class Snapshot:
         Whether the pose comes from a recording.
     failure : str or None
         What ended the model, if something did; a reset starts it again.
-    offers_spline : bool
-        Whether this model's field is a spline.
-    spline : object or None
-        The field as a spline (landmarks, weights, motion, centre, scale, kernel) where the model offers it;
-        None where nothing is displaced.
+    spline : callable or None
+        Returns the field as a spline (landmarks, weights, motion, centre, scale, kernel), or None where nothing is
+        displaced; there if the model offers it. It may cost as much as a step: call it when it is needed.
     """
 
     step: int
@@ -160,8 +159,7 @@ class Snapshot:
     frozen: bool = False
     replaying: bool = False
     failure: str | None = None
-    offers_spline: bool = False
-    spline: object = None
+    spline: Callable[[], object] | None = None
 
 
 def follow(pose: NeedlePose, command: Command, dt: float, lag: float, fastest: float) -> NeedlePose:
@@ -495,8 +493,7 @@ class LiveEngine:
             frozen=self._frozen,
             replaying=self._replaying,
             failure=self._failure,
-            offers_spline=offered is not None,
-            spline=None if offered is None else offered(self._state),
+            spline=None if offered is None else partial(offered, self._state),
         )
 
 

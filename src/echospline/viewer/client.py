@@ -103,6 +103,7 @@ class Client:
         training = self.seat.training
         return {
             "scene": self.seat.scene.describe(),
+            "period": self.seat.engine.period,
             "resumed": resumed,
             "pose": {"entry": pose.entry, "tip": pose.tip},
             "model": newest.value.model,

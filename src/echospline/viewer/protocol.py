@@ -130,11 +130,11 @@ def encode_frame(snapshot: Snapshot, number: int, *, recording: bool = False, no
         | REPLAYING * snapshot.replaying
         | FAILED * (snapshot.failure is not None)
         | HAS_REFERENCE * (reference is not None)
-        | SPLINE * (snapshot.offers_spline and reference is None and not nodes)
+        | SPLINE * (snapshot.spline is not None and reference is None and not nodes)
         | RECORDING * recording
     )
-    if flags & SPLINE:
-        count, field = _spline_bytes(snapshot.spline)
+    if snapshot.spline is not None and flags & SPLINE:
+        count, field = _spline_bytes(snapshot.spline())
     else:
         count, field = len(snapshot.displacement), snapshot.displacement.astype("<f4").tobytes()
         if reference is not None:

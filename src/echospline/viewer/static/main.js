@@ -26,6 +26,7 @@ let frame = null;
 let drawn = 0;
 let dirty = true;
 let model = "";
+let period = 1 / 120; // s between steps of the model
 /** @type {string | null} */
 let compared = null;
 let last = performance.now();
@@ -71,6 +72,7 @@ async function enter(message) {
   const pixels = new Uint8Array(await (await link.fetch(`/api/image?scene=${encodeURIComponent(link.scene)}`)).arrayBuffer());
   scene = message.scene;
   model = message.model;
+  period = message.period;
   drawn = 0;
   frame = null;
   const { mesh } = scene;
@@ -342,7 +344,12 @@ function slowReadouts() {
   drawTimes = drawTimes.filter((t) => now - t < 1000);
   const idle = frame !== null && frame.speed === 0 && drawTimes.length <= 14; // the server sends ten a second then
   put("fps", idle ? "at rest" : `${drawTimes.length} frames/s`);
-  if (frame) put("step", frame.duration.toFixed(2));
+  if (frame) {
+    const late = frame.duration > 1000 * period;
+    put("step", frame.duration.toFixed(2));
+    byId("step").classList.toggle("late", late);
+    byId("step").title = late ? `longer than the ${(1000 * period).toFixed(1)} ms between steps: time runs slower than the clock` : "";
+  }
   if (latencies.length) {
     latencies.sort((a, b) => a - b);
     put("latency", latencies[latencies.length >> 1].toFixed(0));
