@@ -45,7 +45,7 @@ def browser_type_launch_args(browser_type_launch_args):
 
 @pytest.fixture(scope="session")
 def browser_context_args(browser_context_args):
-    return {**browser_context_args, "viewport": {"width": 760, "height": 440}, "service_workers": "block"}
+    return {**browser_context_args, "viewport": {"width": 880, "height": 400}, "service_workers": "block"}
 
 
 @pytest.fixture
@@ -278,7 +278,11 @@ def test_a_failing_model_is_shown_and_reset_helps(live, caplog):
 
 
 def test_the_keyboard_alone_completes_an_exercise_and_its_replay_scores_the_same(live, server):
-    live.keyboard.press("e")
+    live.locator("#trainee").focus()
+    live.keyboard.type("E. Mace")  # letters in a field are no commands
+    live.keyboard.press("Tab")
+    expect(live.locator("#start")).to_be_focused()
+    live.keyboard.press("Enter")
     expect(live.locator("#exercise-status")).to_contain_text("Recording")
     hold(live, "ArrowDown", "Number(d.depth) > 13")
     live.keyboard.press("e")
@@ -292,13 +296,22 @@ def test_the_keyboard_alone_completes_an_exercise_and_its_replay_scores_the_same
     assert live.locator("#metrics").inner_text() == metrics
     live.keyboard.press("Escape")
     live.keyboard.press("l")
-    expect(live.locator("#session-rows tr").first).to_contain_text("straight-down")
+    expect(live.locator("#session-rows tr").first).to_contain_text("E. Mace")
     with live.expect_download() as download:
         live.locator("#export-sessions").click()
     assert Path(download.value.path()).read_text().startswith("id,started")
     live.keyboard.press("Escape")
     before = depth(live)
     hold(live, "ArrowUp", f"Number(d.depth) < {before} - 2")  # the needle obeys again
+
+
+def test_after_a_click_the_keys_steer_again(live):
+    live.locator("label:has(#mesh)").click()
+    expect(live.locator("#mesh")).to_be_checked()
+    hold(live, "ArrowDown", "Number(d.depth) > 2")
+    live.keyboard.press("Space")  # resets, and does not press the box again
+    wait_until(live, "d.depth === '0'")
+    expect(live.locator("#mesh")).to_be_checked()
 
 
 def test_targets_move_with_the_tissue(live):

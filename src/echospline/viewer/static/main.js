@@ -249,6 +249,12 @@ range("depth").addEventListener("input", () => controls.enabled && needle.setDep
 byId("compare").addEventListener("change", (event) => compare(/** @type {HTMLSelectElement} */ (event.target).value || null));
 byId("open").addEventListener("click", () => /** @type {HTMLDialogElement} */ (byId("upload")).showModal());
 byId("upload-form").addEventListener("submit", upload);
+// After a click the keys steer again; who tabs to a control keeps it.
+document.addEventListener("click", (event) => {
+  const target = /** @type {HTMLElement} */ (event.target);
+  const control = target.closest("button, summary, input[type=range], input[type=checkbox], input[type=radio]");
+  if (event.detail > 0 && control && !control.closest("dialog")) stage.focus({ preventScroll: true });
+});
 for (const dialog of document.querySelectorAll("dialog")) {
   dialog.addEventListener("click", (event) => event.target === dialog && dialog.close());
   dialog.querySelector("button[data-close]")?.addEventListener("click", () => dialog.close());
