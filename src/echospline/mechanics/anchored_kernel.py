@@ -10,6 +10,7 @@ move. Factored once per scene.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from scipy.linalg import lu_factor, lu_solve
 from echospline.errors import InputError
 from echospline.grid import Floats, as_points
 from echospline.mechanics.compiled import add_product
-from echospline.mechanics.kernels import Kernel
+from echospline.mechanics.kernels import Elastic, Kernel
 from echospline.mechanics.spline import Spline, compliance
 
 
@@ -40,6 +41,10 @@ class AnchoredKernel:
         [U_xB P_x]', what every row needs of the points.
     factors
         LU of L_B.
+    sources : ndarray, shape (K, 2)
+        Where contacts may stand, conditioned.
+    felt, held : ndarray, shape (K c, b c + p)
+        [U_yB P_y] of the sources, and L_B^-1 of it.
     centre, scale
         mm.
     """
@@ -49,12 +54,21 @@ class AnchoredKernel:
     points: Floats
     table: Floats
     factors: Any
+    sources: Floats
+    felt: Floats
+    held: Floats
     centre: Floats
     scale: float
 
     @classmethod
     def factor(
-        cls, kernel: Kernel, anchors: ArrayLike, points: Floats, stiffness: ArrayLike | None = None
+        cls,
+        kernel: Kernel,
+        anchors: ArrayLike,
+        points: Floats,
+        stiffness: ArrayLike | None = None,
+        *,
+        sources: Floats | None = None,
     ) -> AnchoredKernel:
         """Assemble and factor L_B.
 
@@ -68,6 +82,8 @@ class AnchoredKernel:
             Where rows are evaluated (the mesh nodes), mm.
         stiffness : array_like, shape (b,), optional
             As in `spline.factor`; infinite holds exactly.
+        sources : ndarray, shape (K, 2), optional
+            Where contacts may stand, mm.
 
         Raises
         ------
@@ -96,7 +112,34 @@ class AnchoredKernel:
         p = R.shape[1]
         L = np.block([[K, R], [R.T, np.zeros((p, p))]])
         table = np.ascontiguousarray(np.hstack([conditioned.matrix(x, B), conditioned.polynomial(x)]).T)
-        return cls(conditioned, B, x, table, lu_factor(L, check_finite=False), centre, scale)
+        factors = lu_factor(L, check_finite=False)
+        y = np.ascontiguousarray((np.empty((0, 2)) if sources is None else sources - centre) / scale)
+        felt = _felt(conditioned, y, B)
+        held = np.ascontiguousarray(lu_solve(factors, felt.T, check_finite=False).T)
+        return cls(conditioned, B, x, table, factors, y, felt, held, centre, scale)
+
+    @cached_property
+    def form(self) -> Floats:
+        """The kernel as the compiled loops take it: (components, coupling, radius^2)."""
+        if isinstance(self.kernel, Elastic):
+            return np.array([2.0, self.kernel.coupling, self.kernel.radius**2])
+        return np.array([1.0, 0.0, 0.0])
+
+    @cached_property
+    def frame(self) -> Floats:
+        """(centre x, centre y, scale), mm."""
+        return np.array([*self.centre, self.scale])
+
+    @cached_property
+    def columns(self) -> Floats:
+        """The points as (2, n)."""
+        return np.ascontiguousarray(self.points.T)
+
+    @cached_property
+    def L_inverse(self) -> Floats:
+        """L_B^-1: cheaper than its factors for a single point."""
+        inverse: Floats = lu_solve(self.factors, np.eye(len(self.table)), check_finite=False)
+        return np.ascontiguousarray(inverse)
 
     @property
     def components(self) -> int:
@@ -115,18 +158,15 @@ class AnchoredKernel:
 
     def coupling(self, sources: Floats) -> Floats:
         """L_B^-1 [U_By P_y]' for conditioned sources (m, 2), shape (b c + p, m c), interleaved columns."""
-        right = np.vstack([self.kernel.matrix(self.anchors, sources), self.kernel.polynomial(sources).T])
-        held: Floats = lu_solve(self.factors, interleaved(right.T, self.components).T, check_finite=False)
+        felt = _felt(self.kernel, sources, self.anchors)
+        held: Floats = lu_solve(self.factors, felt.T, check_finite=False)
         return held
 
     def between(self, points: Floats, sources: Floats) -> Floats:
         """G of conditioned points (n, 2) and sources (m, 2), both interleaved, shape (n c, m c)."""
         c = self.components
         direct = interleaved(interleaved(self.kernel.matrix(points, sources), c).T, c).T
-        felt = interleaved(
-            np.hstack([self.kernel.matrix(points, self.anchors), self.kernel.polynomial(points)]), c
-        )
-        G: Floats = direct - felt @ self.coupling(sources)
+        G: Floats = direct - self.felt_by(points) @ self.coupling(sources)
         return G
 
     def rows(self, sources: Floats) -> Floats:
@@ -134,6 +174,10 @@ class AnchoredKernel:
         rows = np.ascontiguousarray(interleaved(self.kernel.matrix(sources, self.points), self.components))
         add_product(rows, np.ascontiguousarray(-self.coupling(sources).T), self.table)
         return rows
+
+    def felt_by(self, sources: Floats) -> Floats:
+        """[U_yB P_y] of conditioned sources (m, 2), shape (m c, b c + p)."""
+        return _felt(self.kernel, sources, self.anchors)
 
     def spline(self, sources: Floats, weights: Floats) -> Spline:
         """Return the field of weights (m c, 2 / c) at conditioned sources, anchors included, for any point."""
@@ -151,6 +195,11 @@ class AnchoredKernel:
         )
         landmarks = np.vstack([self.anchors, sources]) * self.scale + self.centre
         return Spline(self.kernel, landmarks, every, held[split:], self.centre, self.scale)
+
+
+def _felt(kernel: Kernel, points: Floats, anchors: Floats) -> Floats:
+    felt = np.hstack([kernel.matrix(points, anchors), kernel.polynomial(points)])
+    return np.ascontiguousarray(interleaved(felt, kernel.components))
 
 
 def interleaved(matrix: Floats, c: int) -> Floats:

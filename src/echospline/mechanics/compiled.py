@@ -1,7 +1,7 @@
-"""The loops that run at every step, compiled ahead of the simulation and cached on disk.
+"""The loops that run at every step, compiled ahead of the simulation and cached on disk: products and kernels.
 
 Plain loops over contiguous rows: memory bandwidth is their limit (`docs/performance.md`). Everything that they
-compute is also written in NumPy, in `response.py`, `interaction.py` and `tps.py`, and the tests compare the two.
+compute is also written in NumPy, in `kernels.py`, `spline.py` and `tps.py`, and the tests compare the two.
 One thread: waking a second costs more than a step.
 """
 
@@ -13,97 +13,205 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-from numba import njit
+from llvmlite import ir
+from numba import njit, types
+from numba.extending import intrinsic
 
 log = logging.getLogger("echospline")
 
-CHUNK = 2048
+OPTIONS: dict[str, Any] = {
+    "cache": True,
+    "nogil": True,
+    "error_model": "numpy",  # a division is checked by who calls, so that loops become vector instructions
+    "fastmath": {"reassoc", "contract", "arcp", "nsz", "afn"},  # sums in any order; infinities and NaN stay
+}
+
+CHUNK = 1024
 """Points per block, so that the sums of one block stay in the first-level cache."""
 
+LN2 = 0.6931471805599453
+ROOT_HALF = 0x3FE6A09E667F3BCD
+"""The bits of sqrt(1/2)."""
 
-@njit(cache=True, fastmath=True, nogil=True)
+
+def _bits_of(_context: Any, _x: Any) -> Any:
+    def generate(_c: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], ir.IntType(64))
+
+    return types.int64(types.float64), generate
+
+
+def _number_of(_context: Any, _i: Any) -> Any:
+    def generate(_c: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], ir.DoubleType())
+
+    return types.float64(types.int64), generate
+
+
+_bits: Any = intrinsic(_bits_of)
+_number: Any = intrinsic(_number_of)
+
+
+@njit(**OPTIONS)
+def ln(x: float) -> Any:
+    """Natural logarithm to rounding, in a form that the compiler turns into vector instructions; finite at 0.
+
+    x = m 2^e with m between sqrt(1/2) and sqrt(2), and ln m = 2 artanh((m - 1) / (m + 1)) as its series.
+    """
+    i = _bits(x)
+    e = (i - ROOT_HALF) >> 52
+    m = _number(i - (e << 52))
+    s = (m - 1.0) / (m + 1.0)
+    z = s * s
+    p = 1.0 / 19.0
+    p = p * z + 1.0 / 17.0
+    p = p * z + 1.0 / 15.0
+    p = p * z + 1.0 / 13.0
+    p = p * z + 1.0 / 11.0
+    p = p * z + 1.0 / 9.0
+    p = p * z + 1.0 / 7.0
+    p = p * z + 1.0 / 5.0
+    p = p * z + 1.0 / 3.0
+    return e * LN2 + 2.0 * (s + s * z * p)
+
+
+@njit(**OPTIONS)
+def kernel(form: Any, dx: float, dy: float) -> Any:
+    """xx, xy, yy of a kernel at an offset; ``form`` is (components, coupling, radius^2)."""
+    r2 = dx * dx + dy * dy
+    if form[0] == 1.0:
+        return r2 * ln(r2), 0.0, 0.0
+    s = r2 + form[2]
+    iso = -(4.0 - 2.0 * form[1]) * (ln(s) + 1.0) - 4.0 * r2 / s
+    f = 4.0 * form[1] / s
+    return iso + f * dx * dx, f * dx * dy, iso + f * dy * dy
+
+
+@njit(**OPTIONS)
+def kernel_rows(
+    form: Any, points: Any, start: int, stop: int, x: float, y: float, out: Any, row: int
+) -> None:
+    """Rows of U for one source at points (2, n), start to stop: out[row, : stop - start], or for two components
+    out[row] and out[row + 1] with all x, then all y."""
+    px, py, m = points[0, start:stop], points[1, start:stop], stop - start
+    if form[0] == 1.0:
+        a = out[row, :m]
+        for i in range(m):
+            dx, dy = px[i] - x, py[i] - y
+            r2 = dx * dx + dy * dy
+            a[i] = r2 * ln(r2)
+        return
+    xx, xy = out[row, :m], out[row, m : 2 * m]
+    yx, yy = out[row + 1, :m], out[row + 1, m : 2 * m]
+    p, q, f = 4.0 - 2.0 * form[1], form[2], 4.0 * form[1]
+    for i in range(m):
+        dx, dy = px[i] - x, py[i] - y
+        r2 = dx * dx + dy * dy
+        s = r2 + q
+        iso = -p * (ln(s) + 1.0) - 4.0 * r2 / s
+        g = f / s
+        xx[i] = iso + g * dx * dx
+        yy[i] = iso + g * dy * dy
+        xy[i] = g * dx * dy
+        yx[i] = xy[i]
+
+
+@njit(**OPTIONS)
+def add_range(
+    out: Any, at: int, weights: Any, first: int, count: int, rows: Any, start: int, stop: int
+) -> None:
+    """out[:, at : at + stop - start] += weights[:, :count] @ rows[first : first + count, start:stop]."""
+    r, n = out.shape[0], stop - start
+    i = 0
+    while i + 1 < r:
+        a, b = out[i, at : at + n], out[i + 1, at : at + n]
+        j = 0
+        while j + 3 < count:
+            h0, h1 = rows[first + j, start:stop], rows[first + j + 1, start:stop]
+            h2, h3 = rows[first + j + 2, start:stop], rows[first + j + 3, start:stop]
+            a0, a1, a2, a3 = weights[i, j], weights[i, j + 1], weights[i, j + 2], weights[i, j + 3]
+            b0, b1 = weights[i + 1, j], weights[i + 1, j + 1]
+            b2, b3 = weights[i + 1, j + 2], weights[i + 1, j + 3]
+            for t in range(n):
+                a[t] += a0 * h0[t] + a1 * h1[t] + a2 * h2[t] + a3 * h3[t]
+                b[t] += b0 * h0[t] + b1 * h1[t] + b2 * h2[t] + b3 * h3[t]
+            j += 4
+        while j < count:
+            h0 = rows[first + j, start:stop]
+            a0, b0 = weights[i, j], weights[i + 1, j]
+            for t in range(n):
+                a[t] += a0 * h0[t]
+                b[t] += b0 * h0[t]
+            j += 1
+        i += 2
+    if i < r:
+        a = out[i, at : at + n]
+        j = 0
+        while j + 3 < count:
+            h0, h1 = rows[first + j, start:stop], rows[first + j + 1, start:stop]
+            h2, h3 = rows[first + j + 2, start:stop], rows[first + j + 3, start:stop]
+            a0, a1, a2, a3 = weights[i, j], weights[i, j + 1], weights[i, j + 2], weights[i, j + 3]
+            for t in range(n):
+                a[t] += a0 * h0[t] + a1 * h1[t] + a2 * h2[t] + a3 * h3[t]
+            j += 4
+        while j < count:
+            h0 = rows[first + j, start:stop]
+            a0 = weights[i, j]
+            for t in range(n):
+                a[t] += a0 * h0[t]
+            j += 1
+
+
+@njit(**OPTIONS)
 def add_product(out: Any, weights: Any, rows: Any) -> None:
     """out (r, n) += weights (r, m) @ rows (m, n), for few rows r: one pass over ``rows`` per pair of them."""
-    r, n = out.shape
-    m = rows.shape[0]
+    n, m = rows.shape[1], rows.shape[0]
     for start in range(0, n, CHUNK):
-        stop = min(n, start + CHUNK)
+        add_range(out, start, weights, 0, m, rows, start, min(n, start + CHUNK))
+
+
+@njit(**OPTIONS)
+def update_rows(
+    rows: Any, single: Any, first: int, count: int, weights: Any, by: Any, start: int, stop: int
+) -> None:
+    """rows[first : first + count, start:stop] += weights (count, r) @ by (r, stop - start), and the same rows in
+    single precision beside them."""
+    r, n = by.shape[0], stop - start
+    for j in range(count):
+        row, copy = rows[first + j, start:stop], single[first + j, start:stop]
         i = 0
         while i + 1 < r:
-            a, b = out[i, start:stop], out[i + 1, start:stop]
-            j = 0
-            while j + 3 < m:
-                h0, h1 = rows[j, start:stop], rows[j + 1, start:stop]
-                h2, h3 = rows[j + 2, start:stop], rows[j + 3, start:stop]
-                a0, a1, a2, a3 = weights[i, j], weights[i, j + 1], weights[i, j + 2], weights[i, j + 3]
-                b0, b1 = weights[i + 1, j], weights[i + 1, j + 1]
-                b2, b3 = weights[i + 1, j + 2], weights[i + 1, j + 3]
-                for t in range(stop - start):
-                    a[t] += a0 * h0[t] + a1 * h1[t] + a2 * h2[t] + a3 * h3[t]
-                    b[t] += b0 * h0[t] + b1 * h1[t] + b2 * h2[t] + b3 * h3[t]
-                j += 4
-            while j < m:
-                h0 = rows[j, start:stop]
-                a0, b0 = weights[i, j], weights[i + 1, j]
-                for t in range(stop - start):
-                    a[t] += a0 * h0[t]
-                    b[t] += b0 * h0[t]
-                j += 1
+            w, v = weights[j, i], weights[j, i + 1]
+            b, d = by[i, :n], by[i + 1, :n]
+            for t in range(n):
+                row[t] += w * b[t] + v * d[t]
             i += 2
         if i < r:
-            a = out[i, start:stop]
-            j = 0
-            while j + 3 < m:
-                h0, h1 = rows[j, start:stop], rows[j + 1, start:stop]
-                h2, h3 = rows[j + 2, start:stop], rows[j + 3, start:stop]
-                a0, a1, a2, a3 = weights[i, j], weights[i, j + 1], weights[i, j + 2], weights[i, j + 3]
-                for t in range(stop - start):
-                    a[t] += a0 * h0[t] + a1 * h1[t] + a2 * h2[t] + a3 * h3[t]
-                j += 4
-            while j < m:
-                h0 = rows[j, start:stop]
-                a0 = weights[i, j]
-                for t in range(stop - start):
-                    a[t] += a0 * h0[t]
-                j += 1
+            w, b = weights[j, i], by[i, :n]
+            for t in range(n):
+                row[t] += w * b[t]
+        for t in range(n):
+            copy[t] = row[t]
 
 
-@njit(cache=True, fastmath=True, nogil=True)
-def update_rows(rows: Any, single: Any, weights: Any, by: Any) -> None:
-    """rows (m, n) += weights (m, r) @ by (r, n), and the same rows in single precision beside them."""
-    m, n = rows.shape
-    r = by.shape[0]
-    for j in range(m):
-        for start in range(0, n, CHUNK):
-            stop = min(n, start + CHUNK)
-            row, copy = rows[j, start:stop], single[j, start:stop]
-            for i in range(r):
-                w, b = weights[j, i], by[i, start:stop]
-                for t in range(stop - start):
-                    row[t] += w * b[t]
-            for t in range(stop - start):
-                copy[t] = row[t]
-
-
-def _try_out() -> None:
-    """Call every loop once with the types that the simulation uses."""
-    for dtype in (np.float32, np.float64):
-        add_product(np.zeros((2, 3), dtype), np.zeros((2, 1), dtype), np.zeros((1, 3), dtype))
-    update_rows(np.zeros((1, 3)), np.zeros((1, 3), np.float32), np.zeros((1, 1)), np.zeros((1, 3)))
-
-
-_ready = threading.Event()
+_ready: set[str] = set()
 _lock = threading.Lock()
 
 
-def compile_ahead(report: Callable[[str], None] = log.warning, *more: Callable[[], None]) -> float:
-    """Compile (first run on a machine) or load every loop, so that no step does.
+def compile_ahead(
+    name: str, try_out: Callable[[], None], report: Callable[[str], None] | None = None
+) -> float:
+    """Compile (first run on a machine) or load a set of loops, so that no step does.
 
     Parameters
     ----------
-    report : callable
-        Gets one sentence if this takes longer than half a second: then the machine compiles, once.
+    name : str
+        Of the set; each is tried out once per process.
+    try_out : callable
+        Calls every loop once with the types that the simulation uses.
+    report : callable, optional
+        Gets one sentence if this takes longer than a second: then the machine compiles. A warning of the logger
+        "echospline" when not given.
 
     Returns
     -------
@@ -111,16 +219,18 @@ def compile_ahead(report: Callable[[str], None] = log.warning, *more: Callable[[
         Seconds that it took; 0 when it was done before.
     """
     with _lock:
-        if _ready.is_set():
+        if name in _ready:
             return 0.0
-        sentence = "compiling the fast step for this machine: once, some ten seconds"
-        timer = threading.Timer(0.5, report, args=(sentence,))
+        say = log.warning if report is None else report
+        timer = threading.Timer(
+            1.0, say, args=("compiling the fast step for this machine, once: half a minute or less",)
+        )
         timer.daemon = True
         begin = time.perf_counter()
         timer.start()
         try:
-            _try_out()
+            try_out()
         finally:
             timer.cancel()
-        _ready.set()
+        _ready.add(name)
         return time.perf_counter() - begin

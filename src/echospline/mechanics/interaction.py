@@ -6,12 +6,18 @@ displacement loads, what withdrawal and tilting do) is read as `docs/theory.md` 
 
 from __future__ import annotations
 
-from math import exp
+from math import exp, inf
 
 import numpy as np
 
 from echospline.grid import Floats
 from echospline.needle import NeedlePose
+
+LET_GO = 1e-4
+"""mm; a landmark that has left the needle is dropped once it is this close to the field without it."""
+
+CALM = 2.5
+"""A step moves no node further than this times the needle's travel and the relaxation due (``loading="follow"``)."""
 
 
 def friction(distance: Floats, speed: float, alpha1: float, alpha2: float, length: float) -> Floats:
@@ -124,3 +130,16 @@ def needle_travel(before: NeedlePose, after: NeedlePose) -> float:
         np.hypot(b[0] - a[0], b[1] - a[1]) for a, b in ((before.entry, after.entry), (before.tip, after.tip))
     ]
     return float(max(ends))
+
+
+def largest_share(start: Floats, end: Floats, limit: float) -> float:
+    """Largest t in [0, 1] with |start + t (end - start)| <= limit in every row; 0 where even the start is beyond."""
+    step = end - start
+    a = (step * step).sum(axis=1)
+    b = (start * step).sum(axis=1)
+    c = (start * start).sum(axis=1) - limit**2
+    if (c > 0).any():
+        return 0.0
+    root = np.sqrt(np.maximum(b * b - a * c, 0.0))
+    t = np.divide(root - b, a, out=np.full_like(a, inf), where=a > 0)
+    return float(min(1.0, t.min(initial=1.0)))

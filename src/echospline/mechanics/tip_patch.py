@@ -90,8 +90,15 @@ class TipPatch:
         """Radius within which the kernel is not taken as smooth."""
         return NEAR * self.half
 
-    def weights(self, point: Floats) -> Floats:
-        """Value at each interpolation point's share in the value at ``point``, shape (21,)."""
-        local = (point - np.asarray(self.centre)) / self.half
-        shares: Floats = chebyshev(local[None], DEGREE)[0] @ COEFFICIENTS
-        return shares
+    @classmethod
+    def around(cls, tip: Floats, ahead: Floats, anchors: Floats, scale: float) -> TipPatch | None:
+        """Return a patch that holds the tip and leaves it room ahead; None where anchors are too close for one.
+
+        All conditioned; ``scale`` is the length that 1 stands for, mm.
+        """
+        held = float(np.hypot(*(anchors - tip).T).min())
+        half = min(HALF_WIDTH / scale, held / (NEAR + 1.0))
+        if half * scale < SMALLEST:
+            return None
+        x, y = tip + 0.7 * half * ahead
+        return cls((float(x), float(y)), half)

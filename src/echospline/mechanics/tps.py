@@ -10,26 +10,34 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from math import expm1, inf, isfinite
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from echospline.errors import InputError
 from echospline.grid import Floats, RegularGrid
-from echospline.mechanics.interaction import follow, friction, load, needle_travel, relax, tip_push
+from echospline.mechanics.anchored_kernel import AnchoredKernel
+from echospline.mechanics.fused import FusedState, FusedStep, Setting
+from echospline.mechanics.interaction import (
+    CALM,
+    LET_GO,
+    follow,
+    friction,
+    largest_share,
+    load,
+    needle_travel,
+    relax,
+    tip_push,
+)
 from echospline.mechanics.kernels import Kernel, ThinPlate
 from echospline.mechanics.landmarks import Clamps, contact_lattice
+from echospline.mechanics.response import Precision, Response
 from echospline.mechanics.spline import Spline, factor
 from echospline.needle import ZERO_LENGTH, NeedlePose
 
-LET_GO = 1e-4
-"""mm; a landmark that has left the needle is dropped once it is this close to the field without it."""
-
-CALM = 2.5
-"""A step moves no node further than this times the needle's travel and the relaxation due (``loading="follow"``)."""
-
 Nodes = NDArray[np.intp]
+Solver = Literal["response", "refit"]
 
 
 @dataclass(frozen=True)
@@ -155,6 +163,9 @@ class TPSState:
     held_back: int = 0
 
 
+State = TPSState | FusedState
+
+
 class TPSModel:
     """Tissue as a landmark spline.
 
@@ -173,6 +184,11 @@ class TPSModel:
     stiffness : array_like, shape (n,), optional
         Per mesh node: how firmly a landmark there holds its displacement (see `spline.factor`); infinite when
         not given.
+    solver : {"response", "refit"}
+        How a step reaches its numbers: the mesh's response kept and updated (`fused`), or a spline fitted anew at
+        each step, as Algorithm 1 is printed. The states of the two are not interchangeable.
+    precision : {"single", "double"}
+        Of the product that moves the mesh, with the solver "response". The single one stays within 1e-4 mm.
 
     Raises
     ------
@@ -189,7 +205,13 @@ class TPSModel:
         *,
         clamped_points: ArrayLike | None = None,
         stiffness: ArrayLike | None = None,
+        solver: Solver = "response",
+        precision: Precision = "single",
     ) -> None:
+        if solver not in get_args(Solver):
+            raise InputError(f"solver is one of {', '.join(get_args(Solver))}; got {solver!r}")
+        if precision not in get_args(Precision):
+            raise InputError(f"precision is one of {', '.join(get_args(Precision))}; got {precision!r}")
         self.grid = grid
         self.parameters = parameters or TPSParameters()
         self.kernel = kernel or ThinPlate()
@@ -204,25 +226,37 @@ class TPSModel:
             if not (k > 0).all():
                 raise InputError(f"every stiffness must be positive (or infinite); got {k.min()}")
             self.stiffness = k
+        self.fast = self._fused(precision) if solver == "response" else None
 
-    def rest(self) -> TPSState:
+    def rest(self) -> State:
         """State of tissue that no needle has touched."""
-        return TPSState()
+        return TPSState() if self.fast is None else self.fast.rest()
 
-    def displacement(self, state: TPSState) -> Floats:
+    def displacement(self, state: State) -> Floats:
         """Displacement of the mesh nodes, shape (n, 2), mm."""
+        if isinstance(state, FusedState):
+            return state.mesh
         return self.displacement_at(state, self.grid.nodes)
 
-    def displacement_at(self, state: TPSState, points: ArrayLike) -> Floats:
+    def displacement_at(self, state: State, points: ArrayLike) -> Floats:
         """Displacement of any reference points (n, 2) mm, shape (n, 2), mm."""
         points = np.asarray(points, dtype=np.float64)
-        return np.zeros(points.shape) if state.field is None else state.field(points)
+        field = self.spline(state)
+        return np.zeros(points.shape) if field is None else field(points)
 
+<<<<<<< HEAD
     def spline(self, state: TPSState) -> Spline | None:
         """Return the displacement field as a spline (it can be evaluated elsewhere); None where nothing is displaced."""
         return state.field
 
     def advance(self, state: TPSState, pose: NeedlePose, dt: float) -> TPSState:
+=======
+    def spline(self, state: State) -> Spline | None:
+        """Return the displacement field as a spline (it can be evaluated elsewhere); None where nothing is displaced."""
+        return self._fast().spline(state) if isinstance(state, FusedState) else state.field
+
+    def advance(self, state: State, pose: NeedlePose, dt: float) -> State:
+>>>>>>> b552173 (The fast step: interaction and response compiled, the default solver of TPSModel; refit stays as the reference)
         """State after the needle has moved to ``pose`` in ``dt`` seconds, Algorithm 2.
 
         Raises
@@ -232,6 +266,14 @@ class TPSModel:
         """
         if not (isfinite(dt) and dt >= 0):
             raise InputError(f"dt must be zero or a positive number of seconds; got {dt}")
+        if isinstance(state, FusedState):
+            return self._fast().advance(state, pose, dt)
+        if self.fast is not None:
+            raise InputError('this state belongs to a model with the solver "refit"; this one has "response"')
+        return self._refit(state, pose, dt)
+
+    def _refit(self, state: TPSState, pose: NeedlePose, dt: float) -> TPSState:
+        """Algorithm 2 in plain NumPy, a spline fitted anew at each step: the reference for the fast solver."""
         p = self.parameters
         axis = np.array(pose.axis)
         before = state.pose or NeedlePose(pose.entry, pose.entry)
@@ -268,6 +310,40 @@ class TPSModel:
             state = replace(state, lattice=self._on_lattice(state.field))
         return replace(state, pose=pose, tip=tip)
 
+    def _fused(self, precision: Precision) -> FusedStep:
+        """Build the fast solver of this scene."""
+        p, nodes = self.parameters, self.grid.nodes
+        scene = AnchoredKernel.factor(self.kernel, self.anchors, nodes, sources=nodes[self.lattice])
+        softness = None if self.stiffness is None else scene.compliance(self.stiffness[self.lattice])
+        x0, x1, y0, y1 = self.grid.extent
+        walls = {"left": x0, "right": x1, "top": y0, "bottom": y1}
+        free = {"left": -inf, "right": inf, "top": -inf, "bottom": inf}
+        numbers = (p.sigma, p.delta, p.alpha1, p.alpha2, p.alpha3, p.length, p.drag, self.gap)
+        setting = Setting(
+            np.array([*numbers, p.loading == "immediate", p.tip == "node"]),
+            np.ascontiguousarray(nodes[self.lattice].T),
+            np.array([walls[e] if e in self.clamps.edges else free[e] for e in walls]),
+            self.clamps.points,
+            self._node_place if p.tip == "node" else None,
+            None if self.stiffness is None else lambda point: self._softness(scene, point),
+        )
+        return FusedStep(Response(scene, self.lattice, precision, softness), setting)
+
+    def _fast(self) -> FusedStep:
+        if self.fast is None:
+            raise InputError('this state belongs to a model with the solver "response"; this one has "refit"')
+        return self.fast
+
+    def _node_place(self, tip: tuple[float, float]) -> tuple[float, float, bool]:
+        """Node nearest to the tip (mm), and whether it can move."""
+        node = self.grid.nearest(tip)
+        x, y = self.grid.nodes[node]
+        return float(x), float(y), node not in self.clamps.nodes
+
+    def _softness(self, scene: AnchoredKernel, point: tuple[float, float]) -> float:
+        k = np.full(1, inf) if self.stiffness is None else self.stiffness[[self.grid.nearest(point)]]
+        return float(scene.compliance(k)[0])
+
     def _hold_back(
         self, old: TPSState, new: TPSState, q: Floats, tip: Tip | None, limit: float
     ) -> tuple[TPSState, Tip | None]:
@@ -284,7 +360,7 @@ class TPSModel:
             return replace(new, q=q, field=field, lattice=u), tip
         stay = None if tip is None else replace(tip, q=self.displacement_at(old, tip.point[None])[0])
         rest = _zero(self._on_lattice(self._fit(new.contacts, new.q, stay)), was) - was
-        share = _largest_share(rest, _zero(u, was) - was, limit)
+        share = largest_share(rest, _zero(u, was) - was, limit)
         q = new.q + share * (q - new.q)
         if tip is not None and stay is not None:
             tip = replace(tip, q=stay.q + share * (tip.q - stay.q))
@@ -326,7 +402,7 @@ class TPSModel:
         listed = np.zeros(len(points), dtype=bool)
         listed[here] = True
         member = touched if leave_at_once else touched | listed
-        q, s, grip = u, np.clip(along, 0.0, pose.depth), np.empty_like(u)
+        q, s, grip = u.copy(), np.clip(along, 0.0, pose.depth), np.empty_like(u)
         q[here] = state.q
         fresh = touched.copy()
         fresh[here[state.touching]] = False
@@ -453,16 +529,3 @@ def _spacing(grid: RegularGrid, lattice: Nodes) -> float:
 
 def _zero(field: Floats | None, like: Floats) -> Floats:
     return np.zeros_like(like) if field is None else field
-
-
-def _largest_share(start: Floats, end: Floats, limit: float) -> float:
-    """Largest t in [0, 1] with |start + t (end - start)| <= limit in every row; 0 where even the start is beyond."""
-    step = end - start
-    a = (step * step).sum(axis=1)
-    b = (start * step).sum(axis=1)
-    c = (start * start).sum(axis=1) - limit**2
-    if (c > 0).any():
-        return 0.0
-    root = np.sqrt(np.maximum(b * b - a * c, 0.0))
-    t = np.divide(root - b, a, out=np.full_like(a, inf), where=a > 0)
-    return float(min(1.0, t.min(initial=1.0)))
