@@ -56,7 +56,7 @@ def fem_truth():
 def test_spline_fields_are_what_the_model_shows(kernel):
     """Unit fields times parameters against the model stepped through the same poses, rest included."""
     parameters = printed(sigma=0.8, delta=2.0, alpha1=0.03, alpha2=0.11, alpha3=0.6, length=1.7)
-    model = TPSModel(GRID, parameters=parameters, kernel=kernel)
+    model = TPSModel(GRID, parameters=parameters, kernel=kernel, precision="double")
     seen = observe(model, Insertion.straight((12, 0), 60, 20, 5, dwell=2.0), rest=2.0)
     values = {"delta": 2.0, "length": 1.7, "alpha3": 0.6, "sigma": 0.8}
     field = SplineFields(model, seen).fields(values) @ np.array([0.03, 0.11, 0.8])

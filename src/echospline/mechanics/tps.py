@@ -244,19 +244,11 @@ class TPSModel:
         field = self.spline(state)
         return np.zeros(points.shape) if field is None else field(points)
 
-<<<<<<< HEAD
-    def spline(self, state: TPSState) -> Spline | None:
-        """Return the displacement field as a spline (it can be evaluated elsewhere); None where nothing is displaced."""
-        return state.field
-
-    def advance(self, state: TPSState, pose: NeedlePose, dt: float) -> TPSState:
-=======
     def spline(self, state: State) -> Spline | None:
         """Return the displacement field as a spline (it can be evaluated elsewhere); None where nothing is displaced."""
         return self._fast().spline(state) if isinstance(state, FusedState) else state.field
 
     def advance(self, state: State, pose: NeedlePose, dt: float) -> State:
->>>>>>> b552173 (The fast step: interaction and response compiled, the default solver of TPSModel; refit stays as the reference)
         """State after the needle has moved to ``pose`` in ``dt`` seconds, Algorithm 2.
 
         Raises
