@@ -13,6 +13,7 @@ import json
 import multiprocessing
 import socket
 import struct
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -37,7 +38,9 @@ PICTURE = np.random.default_rng(1).integers(0, 256, (1, SIDE, SIDE), dtype=np.ui
 def listen(port: int, seconds: float, pause: float, transforms: float, pipe: Connection) -> None:
     """Peer process: read images (sleeping ``pause`` after each), send transforms; report ages and counts."""
     warm_up()
+    sys.setswitchinterval(0.0005)  # the peer's two threads shall not wait 5 ms for each other
     connection = socket.create_connection(("127.0.0.1", port))
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     until = time.time() + seconds
     sent = 0
 
