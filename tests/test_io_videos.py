@@ -180,3 +180,17 @@ def test_sound_alone_is_no_cine(tmp_path: Path) -> None:
         movie.mux(stream.encode(None))
     with pytest.raises(InputError, match="without a video stream"):
         read(tmp_path / "a.mp4", spacing=(0.1, 0.1))
+
+
+@pytest.mark.parametrize(
+    ("codec", "pix_fmt"),
+    [("ffv1", "gray"), ("mjpeg", "yuvj420p"), ("libx264", "yuv420p"), ("mpeg4", "yuv420p")],
+)
+def test_a_video_with_a_hole_in_its_middle_is_refused(tmp_path: Path, codec: str, pix_fmt: str) -> None:
+    data = bytearray(encoded(tmp_path / "a", codec, pix_fmt, "avi", moving(30)).read_bytes())
+    packets = data.find(b"movi") + 4, data.rfind(b"idx1")
+    middle, length = sum(packets) // 2, (packets[1] - packets[0]) // 8
+    data[middle : middle + length] = bytes(length)
+    (tmp_path / "b").write_bytes(data)
+    with pytest.raises(InputError, match=r"cut short|damaged"):
+        read(tmp_path / "b", spacing=(0.1, 0.1))
