@@ -20,6 +20,8 @@ from echospline.errors import InputError
 from echospline.grid import Floats, RegularGrid, as_points
 
 Map = NDArray[np.float32]
+CHECK_EVERY = 8
+"""Rows and columns between pixels at which an inverse map is composed with the forward map."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,7 @@ class InverseMap:
         Reference position as a pixel index (column, row); NaN where no tissue comes to lie.
         Up to half a pixel beyond the first and last.
     residual : float
-        Largest distance in pixels between a pixel and the forward map of where it comes from, over every fourth
+        Largest distance in pixels between a pixel and the forward map of where it comes from, at every eighth
         row and column.
     """
 
@@ -168,17 +170,29 @@ class Deformation:
         deformed = reference + self._u / image.spacing
         x, y = np.full((ny, nx), np.nan, np.float32), np.full((ny, nx), np.nan, np.float32)
         _trace_back(np.ascontiguousarray(reference), np.ascontiguousarray(deformed), x, y)
-        return InverseMap(image, x, y, self._residual(image, x, y))
+        first, step = reference[0, 0], reference[1, 1] - reference[0, 0]
+        residual = _composed(np.ascontiguousarray(self._u / image.spacing), first, step, x, y, CHECK_EVERY)
+        return InverseMap(image, x, y, float(residual))
 
-    def _residual(self, image: RegularGrid, x: Map, y: Map, every: int = 4) -> float:
-        rows, columns = np.mgrid[0 : x.shape[0] : every, 0 : x.shape[1] : every]
-        back = np.stack([x[::every, ::every], y[::every, ::every]], axis=-1).astype(np.float64).reshape(-1, 2)
-        found = np.isfinite(back[:, 0])
-        if not found.any():
-            return 0.0
-        again = image.to_index(self.forward(image.to_mm(back[found])))
-        asked = np.stack([columns, rows], axis=-1).reshape(-1, 2)[found]
-        return float(np.nanmax(np.hypot(*(again - asked).T), initial=0.0))
+
+@njit(cache=True, nogil=True)
+def _composed(u: Any, first: Any, step: Any, x: Any, y: Any, every: Any) -> Any:
+    """Largest distance between a pixel and the forward map of where it comes from; all in pixel units."""
+    ny, nx, _ = u.shape
+    worst = 0.0
+    for row in range(0, x.shape[0], every):
+        for column in range(0, x.shape[1], every):
+            fx, fy = (x[row, column] - first[0]) / step[0], (y[row, column] - first[1]) / step[1]
+            if not (0.0 <= fx <= nx - 1 and 0.0 <= fy <= ny - 1):
+                continue  # no tissue, or the half pixel beyond the mesh
+            i, j = min(int(fx), nx - 2), min(int(fy), ny - 2)
+            s, t = fx - i, fy - j
+            again_x = x[row, column] + (1 - t) * ((1 - s) * u[j, i, 0] + s * u[j, i + 1, 0])
+            again_y = y[row, column] + (1 - t) * ((1 - s) * u[j, i, 1] + s * u[j, i + 1, 1])
+            again_x += t * ((1 - s) * u[j + 1, i, 0] + s * u[j + 1, i + 1, 0])
+            again_y += t * ((1 - s) * u[j + 1, i, 1] + s * u[j + 1, i + 1, 1])
+            worst = max(worst, np.hypot(again_x - column, again_y - row))
+    return worst
 
 
 @njit(cache=True, nogil=True)
@@ -209,28 +223,30 @@ def _trace_back(reference: Any, deformed: Any, x: Any, y: Any) -> None:
                     low_y, high_y = min(low_y, qy), max(high_y, qy)
             first_row, last_row = max(0, int(np.ceil(low_y))), min(rows - 1, int(np.floor(high_y)))
             first, last = max(0, int(np.ceil(low_x))), min(columns - 1, int(np.floor(high_x)))
-            size = abs(bx) + abs(by) + abs(cx) + abs(cy)
             for row in range(first_row, last_row + 1):
+                s, t = 0.5, 0.5
                 for column in range(first, last + 1):
                     px, py = column - ax, row - ay
-                    s, t = 0.5, 0.5
-                    for _ in range(20):  # Newton: quadratic, two or three rounds in a sound cell
-                        fx = px - s * bx - t * cx - s * t * dx
-                        fy = py - s * by - t * cy - s * t * dy
-                        if abs(fx) + abs(fy) < 1e-9 * size:
+                    # Newton, from where the pixel before was found: quadratic, one or two rounds in a sound cell
+                    missed = True
+                    for _ in range(20):
+                        fx = px - s * (bx + t * dx) - t * cx
+                        fy = py - s * (by + t * dy) - t * cy
+                        if fx * fx + fy * fy < 1e-10:
+                            missed = False
                             break
                         jsx, jsy = bx + t * dx, by + t * dy
                         jtx, jty = cx + s * dx, cy + s * dy
                         det = jsx * jty - jsy * jtx
                         if det == 0.0:
                             break
-                        s += (fx * jty - fy * jtx) / det
-                        t += (jsx * fy - jsy * fx) / det
-                        if abs(s) > 1e3 or abs(t) > 1e3:
+                        scale = 1.0 / det
+                        s += (fx * jty - fy * jtx) * scale
+                        t += (jsx * fy - jsy * fx) * scale
+                        if not (-1e3 < s < 1e3 and -1e3 < t < 1e3):
                             break
-                    fx = px - s * bx - t * cx - s * t * dx
-                    fy = py - s * by - t * cy - s * t * dy
-                    near = abs(fx) + abs(fy) < 1e-6 * size
-                    if near and s0 <= s <= s1 and t0 <= t <= t1:
+                    if missed:
+                        s, t = 0.5, 0.5
+                    elif s0 <= s <= s1 and t0 <= t <= t1:
                         x[row, column] = rx + s * wx
                         y[row, column] = ry + t * wy
