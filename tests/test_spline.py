@@ -138,7 +138,7 @@ def test_wrong_number_of_displacements_is_refused():
         factor(ThinPlate(), points).solve(d[:-1])
 
 
-@example(np.full((6, 2), 8.98846567e307) * np.arange(6)[:, None] % 1.7e308)
+@example(np.array([[0.0, 8.98846567e307]] * 3 + [[8.98846567e307, -8.98846567e307]] * 3))
 @given(arrays(np.float64, (6, 2), elements=st.floats(allow_nan=True, allow_infinity=True, width=64)))
 def test_any_landmarks_are_fitted_or_refused(points):
     d = np.arange(12.0).reshape(6, 2) / 12
