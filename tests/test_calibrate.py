@@ -10,7 +10,9 @@ from echospline.calibrate import calibrate
 from echospline.cli.app import app
 from echospline.errors import InputError
 from echospline.io import read_displacement
+from echospline.io.tracks import write_track
 from echospline.scenario import load
+from echospline.tracking import Track
 
 SCENE = """
 [image]
@@ -122,3 +124,26 @@ def test_a_cohort_gives_one_folder_per_recording_and_resumes(recorded, tmp_path)
 def test_bad_input_is_refused(recorded, tmp_path, changes, message):
     with pytest.raises(InputError, match=message):
         calibrate(**{"field": str(recorded), "out": str(tmp_path), **changes})
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".mha"])
+def test_tracked_motion_is_identified_without_the_points_that_were_lost(recorded, tmp_path, suffix):
+    """Half of the points carry nonsense and say so by their confidence; the needle comes from a path of its own."""
+    record = read_displacement(recorded / "displacement.npz")
+    confidence = np.ones(record.displacement.shape[:2])
+    confidence[:, ::2] = 0.1
+    spoilt = record.displacement + np.where(confidence < 0.5, 3.0, 0.0)[..., None]
+    write_track(tmp_path / f"track{suffix}", Track(record.points, record.times, spoilt, confidence))
+    scene = str(recorded / "scenario.toml")
+    with pytest.raises(InputError, match="--needle"):
+        calibrate(field=str(tmp_path / f"track{suffix}"), out=str(tmp_path / "a"), scenario=scene)
+    report = calibrate(
+        field=str(tmp_path / f"track{suffix}"), out=str(tmp_path / "b"), scenario=scene, bootstrap=0,
+        needle=str(recorded / "displacement.npz"),
+    )  # fmt: skip
+    assert report["values"]["tip"] == pytest.approx(0.3, rel=1e-2)
+    everything = calibrate(
+        field=str(tmp_path / f"track{suffix}"), out=str(tmp_path / "c"), scenario=scene, bootstrap=0,
+        needle=str(recorded / "displacement.npz"), confidence=0.0,
+    )  # fmt: skip
+    assert everything["mae_mm"] > 10 * report["mae_mm"]

@@ -14,8 +14,9 @@ from echospline.charts import error_map
 from echospline.errors import InputError
 from echospline.grid import Floats
 from echospline.identify import Identification, Objective, grid_search, identify
-from echospline.io import read_displacement
+from echospline.io.needle_path import read_needle
 from echospline.io.part import give_name, part_of, writing
+from echospline.io.tracks import read_track
 from echospline.mechanics.fem import FEMModel
 from echospline.mechanics.green import GreenModel
 from echospline.mechanics.tps import TPSModel
@@ -41,6 +42,8 @@ def calibrate(
     model: str | None = None,
     objective: Objective = "mae",
     method: str = "closed",
+    needle: str | None = None,
+    confidence: float = 0.5,
     frames: int = 60,
     runs: int = 2000,
     bootstrap: int = 200,
@@ -51,7 +54,7 @@ def calibrate(
     Parameters
     ----------
     field : str
-        ``displacement.npz`` of a simulation or a tracking, or a folder that holds one.
+        ``displacement.npz`` of a simulation, ``.npz`` or ``.mha`` of a tracking, or a folder with a displacement.npz.
     out : str
         Folder for ``identified.toml`` (a scenario), ``identification.json``, ``error_map.png`` and ``.svg``.
     scenario : str, optional
@@ -62,6 +65,10 @@ def calibrate(
         What is made least.
     method : {"closed", "grid"}
         Closed form and a small search, or the paper's brute force.
+    needle : str, optional
+        Path of the needle (CSV, or the npz of another record) where the record holds none.
+    confidence : float
+        Tracked points below this (0 to 1) are left out, frame by frame.
     frames : int
         Frames used, evenly spaced, the stops of the needle among them; 0 for all.
     runs : int
@@ -96,9 +103,7 @@ def calibrate(
     if method not in ("closed", "grid"):
         raise InputError(f'method is "closed" or "grid"; got {method!r}')
     scene = scene.with_values({**PRINTED, "model.kind": kind})
-    record = read_displacement(path)
-    poses = [record.pose(i) for i in range(len(record))]
-    seen = Observation(record.points, record.displacement, record.times, poses)
+    seen = _observation(path, needle, confidence)
     seen = seen.frames(_chosen(seen, frames))
     grid = scene.grid(scene.read_image(source.parent))
     built = build_model(scene, grid, folder=source.parent)
@@ -124,6 +129,22 @@ def calibrate(
         part.write_text(json.dumps(report, indent=1, allow_nan=False), encoding="utf-8")
         give_name(part, folder / "identification.json")
     return report
+
+
+def _observation(path: Path, needle: str | None, confidence: float) -> Observation:
+    """Read a record; points that were not tracked well enough become nan."""
+    if not 0.0 <= confidence <= 1.0:
+        raise InputError(f"confidence must lie in 0 to 1; got {confidence}")
+    track = read_track(path)
+    record = track.motion
+    insertion = None if needle is None else read_needle(needle)
+    poses = [
+        record.pose(i) if insertion is None else insertion.pose(float(t)) for i, t in enumerate(record.times)
+    ]
+    if all(pose.depth == 0 for pose in poses):
+        raise InputError(f"{path} holds no needle; say where it was with --needle FILE.csv")
+    seen = np.where(track.confidence[..., None] >= confidence, record.displacement, np.nan)
+    return Observation(record.points, seen, record.times, poses)
 
 
 def _forces(built: Any) -> FEMModel | GreenModel:

@@ -21,7 +21,7 @@ def identify(
         list[str],
         typer.Argument(
             metavar="FIELD...",
-            help="displacement.npz of a simulation or a tracking, or a folder that holds one; several make a cohort",
+            help="displacement.npz of a simulation, .npz or .mha of `track`, or a folder of a run; several make a cohort",
         ),
     ],
     out: Annotated[Path, typer.Option("--out", help="folder for the results")] = Path("out/identify"),
@@ -41,6 +41,13 @@ def identify(
             "--method", help="closed (closed form and a small search) or grid (the paper's brute force)"
         ),
     ] = "closed",
+    needle: Annotated[
+        Path | None,
+        typer.Option("--needle", help="path of the needle (CSV or npz) where the field holds none"),
+    ] = None,
+    confidence: Annotated[
+        float, typer.Option("--confidence", min=0, max=1, help="tracked points below this are left out")
+    ] = 0.5,
     frames: Annotated[
         int, typer.Option("--frames", min=0, help="frames used, evenly spaced; 0 for all")
     ] = 60,
@@ -70,6 +77,7 @@ def identify(
         arguments: dict[str, Any] = {
             "field": str(Path(field).resolve()), "out": str(folder.resolve()),
             "scenario": None if scenario is None else str(scenario.resolve()), "model": model, "objective": objective,
+            "needle": None if needle is None else str(needle.resolve()), "confidence": confidence,
             "method": method, "frames": frames, "runs": runs, "bootstrap": bootstrap, "seed": seed,
         }  # fmt: skip
         tasks.append(Task(name, arguments))
