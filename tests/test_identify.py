@@ -53,7 +53,8 @@ def fem_truth():
 
 
 @pytest.mark.parametrize("kernel", [ThinPlate(), Elastic(0.45, 1.0)], ids=["thin plate", "elastic"])
-def test_spline_fields_are_what_the_model_shows(kernel):
+@pytest.mark.parametrize("solver", ["refit", "response"])
+def test_spline_fields_are_what_the_model_shows(kernel, solver):
     """Unit fields times parameters against the model stepped through the same poses, rest included."""
     parameters = printed(sigma=0.8, delta=2.0, alpha1=0.03, alpha2=0.11, alpha3=0.6, length=1.7)
     model = TPSModel(GRID, parameters=parameters, kernel=kernel, precision="double")

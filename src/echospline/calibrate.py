@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from echospline.charts import error_map
 from echospline.errors import InputError
@@ -111,7 +112,8 @@ def calibrate(
         fields = (
             SplineFields(built, seen) if isinstance(built, TPSModel) else ForceFields(_forces(built), seen)
         )
-        found = identify(fields, objective, seed=seed, bootstrap=bootstrap)
+        with threadpool_limits(limits=1):  # many small products: more threads only wait for each other
+            found = identify(fields, objective, seed=seed, bootstrap=bootstrap)
     else:
         found = grid_search(
             _run(scene, built, source.parent, seen), _axes(kind, seen, runs), seen.displacement, objective

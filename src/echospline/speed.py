@@ -25,7 +25,8 @@ from echospline.mechanics.forces import NeedleForces
 from echospline.mechanics.green import GreenModel
 from echospline.mechanics.kernels import Elastic, Kernel, ThinPlate
 from echospline.mechanics.model import TissueModel
-from echospline.mechanics.tps import TPSModel, TPSParameters
+from echospline.mechanics.response import Precision
+from echospline.mechanics.tps import Solver, TPSModel, TPSParameters
 from echospline.needle import Insertion, NeedlePose
 
 Step = Callable[[NeedlePose], Floats]
@@ -102,9 +103,9 @@ def _fem_compliance(grid: RegularGrid, poses: Sequence[NeedlePose]) -> Step:
     return lambda pose: columns.solve(loads(pose))
 
 
-def _tps(kernel: Kernel) -> Build:
+def _tps(kernel: Kernel, solver: Solver, precision: Precision = "single") -> Build:
     def build(grid: RegularGrid, _: Sequence[NeedlePose]) -> Step:
-        return _stepped(TPSModel(grid, CLAMPED, LANDMARKS, kernel))
+        return _stepped(TPSModel(grid, CLAMPED, LANDMARKS, kernel, solver=solver, precision=precision))
 
     return build
 
@@ -138,8 +139,11 @@ METHODS = (
     Method("FEM, factored once", "fem", _fem_factored),
     Method("FEM, compliance columns", "fem", _fem_compliance, 20_000),
     Method("TPS, literal: all nodes sources, L inverted per step", "tps", _literal, 5_000, paper=True),
-    Method("TPS, landmarks, refitted per step", "tps", _tps(ThinPlate())),
-    Method("TPS, elastic kernel, refitted per step", "tps", _tps(Elastic())),
+    Method("TPS, landmarks, refitted per step", "tps", _tps(ThinPlate(), "refit")),
+    Method("TPS, landmarks, fast path", "tps", _tps(ThinPlate(), "response")),
+    Method("TPS, landmarks, fast path in double precision", "tps", _tps(ThinPlate(), "response", "double")),
+    Method("TPS, elastic kernel, refitted per step", "tps", _tps(Elastic(), "refit")),
+    Method("TPS, elastic kernel, fast path", "tps", _tps(Elastic(), "response")),
     Method("Green's function", "green", _green),
 )
 
