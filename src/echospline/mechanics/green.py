@@ -135,15 +135,15 @@ class GreenModel:
         travel = travelled(state.pose, pose)
         inside = pose.depth >= ZERO_LENGTH and bool(self.grid.contains(pose.tip)[0])
         tip = self.forces.advance_tip(state.tip, pose, travel, inside=inside)
-        columns, covered = self._stations(state, pose)
+        columns, covered, ahead = self._columns(state, pose, push=tip != 0)
         before = np.zeros((columns.shape[1], 1))
         kept = min(len(state.friction), len(before))
         before[:kept, 0] = state.friction[:kept]
         steady = np.full_like(before, self.forces.friction * pose.speed)
         friction = self.forces.advance_friction(before, steady, travel, dt)[:, 0]
         field = columns @ (friction * covered)
-        if tip != 0:
-            field = field + self._axial(np.array([pose.tip]), pose)[:, 0] * tip
+        if ahead is not None:
+            field = field + ahead * tip
         return GreenState(pose, tip, friction, columns, _vectors(field))
 
     def displacement(self, state: GreenState) -> Floats:
@@ -187,8 +187,13 @@ class GreenModel:
         held: Floats = np.clip(points, (x0, y0), (x1, y1))
         return held
 
-    def _stations(self, state: GreenState, pose: NeedlePose) -> tuple[Floats, Floats]:
-        """Columns of the stations at this pose; those of the last pose are kept while the axis is the same."""
+    def _columns(
+        self, state: GreenState, pose: NeedlePose, *, push: bool
+    ) -> tuple[Floats, Floats, Floats | None]:
+        """Columns of the stations, the length each stands for, and the tip's column where it pushes.
+
+        Columns of the last pose are kept while the axis is the same; all others come from one product.
+        """
         points, covered = self.stations(pose)
         same = (
             state.pose is not None
@@ -197,9 +202,13 @@ class GreenModel:
             and np.allclose(state.pose.axis, pose.axis, rtol=0, atol=1e-12)
         )
         kept = min(state.columns.shape[1], len(points)) if same else 0
-        if kept == len(points):
-            return state.columns[:, :kept], covered
-        return np.hstack([state.columns[:, :kept], self._axial(points[kept:], pose)]), covered
+        wanted = np.vstack([points[kept:], pose.tip]) if push else points[kept:]
+        fresh = self._axial(wanted, pose) if len(wanted) else np.zeros((len(state.columns), 0))
+        ahead = fresh[:, -1] if push else None
+        stations = state.columns[:, :kept]
+        if kept < len(points):
+            stations = np.hstack([stations, fresh[:, : len(points) - kept]])
+        return stations, covered, ahead
 
     def _axial(self, sources: Floats, pose: NeedlePose) -> Floats:
         """Displacement of the nodes by unit forces along the axis at sources (k, 2), shape (2 n, k), mm/N."""
