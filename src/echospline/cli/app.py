@@ -6,6 +6,8 @@ import sys
 
 import typer
 
+from echospline.cli.dataset import dataset
+from echospline.cli.exvivo import exvivo
 from echospline.cli.identify import identify
 from echospline.cli.info import info
 from echospline.cli.link import link
@@ -32,13 +34,17 @@ app.command()(simulate)
 app.command()(demo)
 app.command()(info)
 app.command()(identify)
-app.command()(study)
+studies = typer.Typer()
+studies.callback(invoke_without_command=True)(study)
+studies.command()(exvivo)
+app.add_typer(studies, name="study")
 app.command()(live)
 app.add_typer(sessions, name="sessions")
 app.command()(link)
 app.command()(recorded)
 app.command()(phantom)
 app.command()(track)
+app.command()(dataset)
 
 
 def main() -> None:

@@ -16,6 +16,7 @@ from echospline.study import study as run_study
 
 
 def study(
+    context: typer.Context,
     out: Annotated[Path, typer.Option("--out", help="folder for figures, tables and report.html")] = Path(
         "out/study"
     ),
@@ -37,6 +38,8 @@ def study(
     Every model is compared with finite elements under the same needle, in accuracy (fitted and held-out insertions, four
     moduli in both readings) and in time per step (every method named). Cases that are in the folder already are not run again.
     """
+    if context.invoked_subcommand is not None:
+        return
     progress = Console(stderr=True)
     command = f"echospline study{' --quick' if quick else ''} --seed {seed}"
     result = run_study(

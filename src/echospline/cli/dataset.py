@@ -1,0 +1,94 @@
+"""``echospline dataset``: many drawn insertions, imaged, with their true motion, for learning."""
+
+from __future__ import annotations
+
+import json
+import sys
+from importlib.resources import as_file, files
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from echospline.dataset import create_store, make_sample, write_summary
+from echospline.errors import InputError
+from echospline.scenario import load
+from echospline.sweep import Task, sweep
+
+
+def dataset(
+    scenarios: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="[SCENARIO]...", help="bases that are varied in turn (.toml)"),
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", help="the Zarr store, a folder")] = Path("out/dataset.zarr"),
+    n: Annotated[int, typer.Option("--n", min=1, max=10_000_000, help="number of samples")] = 10,
+    frames: Annotated[
+        int, typer.Option(min=2, max=1000, help="frames per sample, evenly over the insertion")
+    ] = 8,
+    seed: Annotated[int, typer.Option(min=0, help="of the draws")] = 0,
+    workers: Annotated[int, typer.Option(min=0, help="processes on this machine; 0 for none")] = 0,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="TCP://HOST:PORT", help="a running dask scheduler; it must see the same files"),
+    ] = None,
+    json_: Annotated[bool, typer.Option("--json", help="print the report as JSON, nothing else")] = False,
+) -> None:
+    """Draw insertions and image them: pictures, true displacement, needle mask and pose, one chunk per sample.
+
+    Tissue, probe, needle path and speckle are drawn around the bases; sample i depends on its base, i and the seed alone,
+    and `scenarios/0000000.toml` makes it again (`echospline phantom`). A run that was interrupted goes on where it
+    stopped, and a larger --n adds samples.
+    """
+    with as_file(files("echospline.data").joinpath("dataset.toml")) as own:
+        bases = [str(path.resolve()) for path in scenarios or [own]]
+        shapes = {(s.phantom.grid().shape, s.mesh.nodes) for s in map(load, map(Path, bases))}
+        if len(shapes) > 1:
+            raise InputError(
+                "all bases of a dataset need the same phantom.size, phantom.pixel and mesh.nodes"
+            )
+        began = perf_counter()
+        # names, not paths: the dataset is the same wherever it is made
+        create_store(out, load(Path(bases[0])), n, frames, seed, [Path(b).name for b in bases])
+        tasks = [
+            Task(
+                f"{i:07d}",
+                {"store": str(out.resolve()), "bases": bases, "index": i, "seed": seed, "frames": frames},
+            )
+            for i in range(n)
+        ]
+        with Progress(
+            TextColumn("samples"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+            console=Console(stderr=True), transient=True, disable=json_,
+        ) as bar:  # fmt: skip
+            line = bar.add_task("samples", total=n)
+            outcome = sweep(
+                make_sample, tasks, out / "tasks", workers=workers, scheduler=scheduler,
+                report=lambda name: bar.advance(line),
+            )  # fmt: skip
+        seconds = perf_counter() - began
+    made = n - outcome.resumed - len(outcome.failed)
+    report = {
+        "samples": n,
+        "made": made,
+        "resumed": outcome.resumed,
+        "failed": outcome.failed,
+        "seconds": seconds,
+        "samples_per_second": made / seconds,
+        "largest_mm": max((r["largest_mm"] for r in outcome.results.values()), default=0.0),
+    }
+    write_summary(out, report)
+    if json_:
+        json.dump(report, sys.stdout, indent=1)
+        print()
+    else:
+        Console().print(
+            f"{made} samples of {frames} frames in {seconds:.1f} s ({made / seconds:.2f} per second), {outcome.resumed} were "
+            f"there; results in {out}"
+        )
+    if outcome.failed:
+        name, why = next(iter(outcome.failed.items()))
+        raise InputError(f"{len(outcome.failed)} of {n} samples failed; {name}: {why}")
