@@ -6,6 +6,7 @@ import zipfile
 import numpy as np
 import pytest
 import SimpleITK
+from scipy import stats
 from scipy.interpolate import RegularGridInterpolator
 from typer.testing import CliRunner
 
@@ -13,6 +14,7 @@ from echospline.cli.app import app
 from echospline.cli.track import load
 from echospline.echo import Echo
 from echospline.errors import InputError
+from echospline.exvivo import paired
 from echospline.grid import RegularGrid
 from echospline.io import open_writer, read, read_displacement
 from echospline.io.echoes import EchoWriter, read_echoes
@@ -27,6 +29,7 @@ SCENARIO = """
 kind = "fem"
 [model.forces]
 tip = 0.2
+ramp = 0.0
 [needle]
 entry = [8.0, 0.0]
 angle = 70.0
@@ -144,6 +147,83 @@ def test_rf_file_is_readable_by_itk_and_demodulates_to_the_echoes(cine):
         axis=1,
     )
     assert np.corrcoef(a.ravel(), b.ravel())[0, 1] > 0.99
+
+
+@pytest.mark.parametrize("suffix", ["npz", "mha"])
+def test_identification_from_the_tracked_cine_finds_the_forces(cine, tmp_path, suffix):
+    # the phantom was driven by 0.2 N and 1e-3 N s/mm^2; the region around the needle is masked
+    out = tmp_path / f"field.{suffix}"
+    run("track", cine / "echoes.npz", "--out", out, "--needle", cine / "displacement.npz", "--json")
+    report = json.loads(
+        run(
+            "identify", out, "--scenario", cine / "scenario.toml", "--model", "fem", "--out", tmp_path / "id",
+            "--objective", "rmse", "--bootstrap", "0", "--json",
+        )
+    )["reports"]["field"]  # fmt: skip
+    assert report["values"]["tip"] == pytest.approx(0.2, rel=0.1)
+    assert report["values"]["friction"] == pytest.approx(1e-3, rel=0.25)
+    assert report["rmse_mm"] < 0.03
+
+
+@pytest.fixture(scope="module")
+def protocol(tmp_path_factory):
+    """The paper's experiment on a small phantom, by the command."""
+    folder = tmp_path_factory.mktemp("exvivo")
+    scene = SCENARIO.replace('formats = ["mha"]', "formats = []")
+    (folder / "scene.toml").write_text(scene)
+    result = json.loads(
+        run("study", "exvivo", "--scenario", folder / "scene.toml", "--out", folder / "out", "--depths", "3",
+            "--distance", "3.5", "--json")
+    )  # fmt: skip
+    return folder, result
+
+
+def test_protocol_tells_the_tracker_from_the_models(protocol):
+    folder, result = protocol
+    means = result["means"]
+    assert means["tracker_rmse_mm"] < 0.02
+    # the phantom is driven by finite elements: they must explain it best, seen or unseen
+    assert means["fem_rmse_mm"] < min(means["tps_rmse_mm"], means["elastic_rmse_mm"])
+    assert means["fem_held_out_true_mm"] < min(
+        means["tps_held_out_true_mm"], means["elastic_held_out_true_mm"]
+    )
+    wide = result["fitted to the whole field"]["means"]
+    assert wide["fem_held_out_field_mm"] < 0.03
+    page = (folder / "out" / "report.html").read_text()
+    assert page.count("data:image/png") == 3
+    assert "http" not in page.replace("http-equiv", "")
+
+
+def test_protocol_runs_on_a_recording_with_its_needle(protocol, tmp_path):
+    folder, first = protocol
+    phantom = folder / "out" / "phantom"
+    result = json.loads(
+        run("study", "exvivo", "--cine", phantom / "echoes.npz", "--needle", phantom / "displacement.npz", "--scenario",
+            folder / "scene.toml", "--out", tmp_path, "--depths", "3", "--distance", "3.5", "--json")
+    )  # fmt: skip
+    assert "tracker_rmse_mm" not in result["rows"][0]  # the truth is not known to it
+    for mine, known in zip(result["rows"], first["rows"], strict=True):
+        assert mine["fem_rmse_mm"] == pytest.approx(known["fem_rmse_mm"], rel=1e-6)
+
+
+def test_study_without_a_subcommand_is_still_the_study():
+    text = CliRunner().invoke(app, ["study", "--help"], env={"COLUMNS": "120"}).output
+    assert "--quick" in text
+    assert "exvivo" in text
+
+
+def test_paired_test_against_its_definition():
+    rng = np.random.default_rng(0)
+    b = rng.random(12)
+    a = b + 0.05 + 0.02 * rng.normal(size=12)
+    d = a - b
+    found = paired(a, b)
+    t = d.mean() / (d.std(ddof=1) / np.sqrt(12))
+    assert found["p_t"] == pytest.approx(2 * stats.t.sf(abs(t), 11))
+    low, high = found["interval_95_mm"]
+    assert low < d.mean() < high
+    assert (high - low) / 2 == pytest.approx(2.201 * d.std(ddof=1) / np.sqrt(12), rel=1e-3)
+    assert paired(b, b)["p_t"] is None  # no difference at all: there is nothing to test
 
 
 @pytest.mark.parametrize("suffix", ["npz", "mha"])

@@ -19,7 +19,7 @@ from echospline.io.part import give_name, part_of, writing
 from echospline.models import build_model
 from echospline.needle_echo import OUTER_DIAMETER
 from echospline.phantom_cine import phantom_pictures
-from echospline.scenario import Scenario, load
+from echospline.scenario import PHANTOM, Scenario, load
 from echospline.simulate import simulate
 
 LAYOUT = 1
@@ -96,6 +96,7 @@ def drawn(base: Scenario, index: int, seed: int, frames: int, variation: Variati
         regions.append({"level": level, "ellipse": {"centre": centre.tolist(), "half_axes": half.tolist()}})
     values: dict[str, Any] = {
         "title": f"sample {index}, seed {seed}",
+        "image.file": PHANTOM,
         "tissue.young": base.tissue.young * factor(v.young),
         "model.forces.tip": base.model.forces.tip * factor(v.tip_force),
         "model.forces.friction": base.model.forces.friction * factor(v.friction),
@@ -152,7 +153,7 @@ def create_store(path: Path, base: Scenario, n: int, frames: int, seed: int, sou
                 f"{path} holds a dataset with other {', '.join(differ) or 'image size'}: choose another --out, or the same options"
             )
         for name, (shape, _) in arrays.items():
-            if len(group[name]) < n:
+            if group[name].shape[0] < n:
                 group[name].resize((n, *shape))
         return
     with writing(path):

@@ -9,6 +9,7 @@ from pydantic import Field
 from echospline.echo import Display
 from echospline.errors import InputError
 from echospline.grid import RegularGrid
+from echospline.image import UltrasoundImage
 from echospline.phantom import Inclusion, Layer, Phantom
 from echospline.probe import Probe
 from echospline.sections import Millimetres, Point, Section
@@ -102,6 +103,12 @@ class PhantomSection(Section):
         """Scatter the phantom."""
         regions = tuple(r.region() for r in self.region)
         return Phantom(probe, self.grid(), self.seed, self.per_cell, regions)
+
+    def still(self, probe: Probe) -> UltrasoundImage:
+        """Return the phantom's picture at rest."""
+        phantom = self.phantom(probe)
+        picture = phantom.form(noise_seed=phantom.seed).b_mode(self.display(), phantom.grid)
+        return UltrasoundImage(picture.pixels, picture.grid, "speckle phantom")
 
     def display(self) -> Display:
         """Return how it is shown."""

@@ -38,6 +38,7 @@ from echospline.sections import (
 )
 from echospline.tissue import Circle, Label, Layer, Polygon, Region, Shape, Tissue
 
+PHANTOM = "sample:phantom"
 LARGEST_FILE = 1_000_000
 """Bytes; a scenario is a page of text."""
 
@@ -78,8 +79,10 @@ class Scenario(Section):
         return validated(tree, origin)
 
     def read_image(self, folder: Path) -> UltrasoundImage:
-        """Read the image; a relative path is taken from ``folder``."""
+        """Read the image; a relative path is taken from ``folder``; sample:phantom is [phantom] at rest."""
         section = self.image
+        if section.file == PHANTOM:
+            return self.phantom.still(self.probe.probe())
         name = section.file if section.file.startswith("sample:") else str(folder / section.file)
         return read_image(name, spacing=section.spacing, frame=section.frame, region=section.region)
 

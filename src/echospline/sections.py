@@ -50,7 +50,8 @@ class ImageSection(Section):
     """The tissue before the needle."""
 
     file: str = Field(
-        "sample:calf", description="image, cine or DICOM file, or sample:calf, which ships inside"
+        "sample:calf",
+        description="image, cine or DICOM file, sample:calf, which ships inside, or sample:phantom, made from [phantom]",
     )
     spacing: tuple[Annotated[Millimetres, Field(gt=0)], Annotated[Millimetres, Field(gt=0)]] | None = Field(
         None, description="mm per pixel (lateral, depth); only where the file does not say"

@@ -23,7 +23,7 @@ from echospline.models import build_model
 from echospline.phantom import Phantom
 from echospline.phantom_cine import phantom_pictures
 from echospline.run import run
-from echospline.scenario import Scenario
+from echospline.scenario import PHANTOM, Scenario
 from echospline.simulate import frame_count
 from echospline.speckle import speckle_statistics
 
@@ -69,6 +69,8 @@ def phantom_into(
     scenario: Scenario, out: Path, folder: Path, *, echoes: bool, rf: bool = False, quiet: bool = True
 ) -> dict[str, Any]:
     """Run a scenario on its phantom; returns the report of `run` with a table ``phantom``."""
+    # the resolved scenario names its own picture, so that simulate and identify find the mesh where it was
+    scenario = scenario.with_values({"image.file": PHANTOM, "image.region": None, "image.spacing": None})
     section, probe = scenario.phantom, scenario.probe.probe()
     scattered = section.phantom(probe)
     display = section.display()
