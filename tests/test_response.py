@@ -48,7 +48,7 @@ def ask(
     slots = response.set_contacts(np.searchsorted(inner(), nodes))
     at = NO_TIP
     if tip is not None:
-        at = np.array([1.0, *tip, *e, 1.0])
+        at = np.array([1.0, *tip, *e, 1.0, 0, 0, 0, 0, 0, 0])
         response.prepare(response.scene.conditioned(tip), np.zeros(2), rows=len(NODES))
     return response.field(slots, q, at, soft)[0]
 
@@ -79,7 +79,7 @@ def test_field_is_that_of_a_refitted_spline(kernel: Kernel, precision: Precision
         assert np.abs(got - expected).max() < within * scale, turn
         anywhere = rng.uniform([0, 0], [32, 24], size=(20, 2))
         slots = response.set_contacts(np.searchsorted(inner(), nodes))
-        exact = response.spline(slots, q, np.array([1.0, *tip, *e, 1.0]))(anywhere)
+        exact = response.spline(slots, q, np.array([1.0, *tip, *e, 1.0, 0, 0, 0, 0, 0, 0]))(anywhere)
         assert np.abs(exact - refit(kernel, nodes, q, tip, e)(anywhere)).max() < 1e-9 * scale
         tip = np.clip(tip + rng.normal(size=2) * 0.3, [4, 2], [28, 20])
     patched = response.statistics.patches

@@ -1,7 +1,7 @@
 """One step of the needle's interaction, compiled: `tps.TPSModel.advance` in loops over the landmarks.
 
 The plain NumPy reading is in `tps.py` and `interaction.py`; the names here are the same. A contact is a row of seven
-numbers (`COLUMNS`), the tip one of six (`TIP`). Nothing here reads more than the landmarks; `spread` then reads the
+numbers (`COLUMNS`), the tip one of twelve with the last pose (`TIP`). Nothing here reads more than the landmarks; `spread` then reads the
 response once and gives the mesh.
 """
 
@@ -19,7 +19,9 @@ from echospline.mechanics.interaction import CALM, LET_GO
 from echospline.needle import ZERO_LENGTH
 
 COLUMNS = ("source", "touching", "qx", "qy", "along", "grip x", "grip y")
-TIP = ("present", "x", "y", "qx", "qy", "pushed")
+TIP = ("present", "x", "y", "qx", "qy", "pushed", "posed", "entry x", "entry y", "tip x", "tip y", "reach")
+
+CONTACTS, NOT_YET, DONE = 0, 1, 2
 
 SAME_PLACE = 1e-6
 """mm; a tip this close to a contact speaks for it."""
@@ -40,9 +42,10 @@ def _distance(x: float, y: float, ux: float, uy: float, pose: Any, drag: float) 
 
 @njit(**OPTIONS)
 def touch(
-    places: Any, nodes: Any, mesh: Any, contacts: Any, pose: Any, setting: Any, marks: Any, alongs: Any
-) -> Any:
-    """Contacts after nodes have joined and left; ``marks`` and ``alongs`` are room for one number per source.
+    places: Any, nodes: Any, mesh: Any, contacts: Any, pose: Any, setting: Any, marks: Any, alongs: Any, reach: float
+) -> Any:  # fmt: skip
+    """Contacts after nodes have joined and left; ``marks`` and ``alongs`` are room for one number per source;
+    ``reach`` is the largest displacement at the sources, mm.
 
     ``pose`` is (entry x, y, tip x, y, axis x, y, depth, speed, travel, dt); ``setting`` the model's parameters as
     `fused.py` lists them.
@@ -51,24 +54,53 @@ def touch(
     depth, ax, ay = pose[6], pose[4], pose[5]
     K, k = places.shape[1], contacts.shape[0]
     px, py = places[0], places[1]
-    if depth >= ZERO_LENGTH:
-        for i in range(K):
-            along, d = _distance(px[i], py[i], mesh[nodes[i], 0], mesh[nodes[i], 1], pose, drag)
-            alongs[i] = along
-            marks[i] = -1 if (d <= delta and along <= depth - gap) else -2
-    else:
-        marks[:] = -2
-        alongs[:] = 0.0
     # -2: not touched, -1: touched; listed ones carry their place in the old table: -3 - j not touched, j touched
+    lo, hi = K, 0
+    if depth >= ZERO_LENGTH:
+        # only nodes whose rest position lies within delta and the largest displacement of the shaft are looked at closely
+        far = delta + drag * reach
+        squares = alongs
+        for i in range(K):
+            ox, oy = px[i] - pose[0], py[i] - pose[1]
+            along = ox * ax + oy * ay
+            beyond = along - min(max(along, -reach), depth + reach)
+            cross = ox * ay - oy * ax
+            squares[i] = max(cross * cross, beyond * beyond)
+        for i in range(K):
+            if squares[i] <= far * far * (1.0 + 1e-9) + 1e-9:
+                along, d = _distance(px[i], py[i], mesh[nodes[i], 0], mesh[nodes[i], 1], pose, drag)
+                if d <= delta and along <= depth - gap:
+                    if lo < K:
+                        marks[hi:i] = -2
+                    else:
+                        lo = i
+                    hi = i + 1
+                    marks[i] = -1
+                    alongs[i] = along
     for j in range(k):
         i = int(contacts[j, 0])
-        marks[i] = j if marks[i] == -1 else -3 - j
+        if lo == K:
+            lo, hi = i, i + 1
+            marks[i] = -2
+        if i < lo:
+            marks[i:lo] = -2
+            lo = i
+        if i >= hi:
+            marks[hi : i + 1] = -2
+            hi = i + 1
+        if marks[i] == -1:
+            marks[i] = j
+        else:
+            marks[i] = -3 - j
+            alongs[i] = _distance(px[i], py[i], mesh[nodes[i], 0], mesh[nodes[i], 1], pose, drag)[0]
+            if depth < ZERO_LENGTH:
+                alongs[i] = 0.0
     count = 0
-    for i in range(K):
+    for i in range(lo, hi):
         count += marks[i] >= -1 or (marks[i] <= -3 and not immediate)
     table = np.empty((count, 7))
     at = 0
-    for i in range(K):
+    for i in range(lo, hi):
         mark = marks[i]
         if not (mark >= -1 or (mark <= -3 and not immediate)):
             continue
@@ -347,7 +379,7 @@ def move(
 
     Returns
     -------
-    q, tip, free : (k, 2), (6,), (k, 2)
+    q, tip, free : (k, 2), (12,), (k, 2)
         New displacements; the field without the contacts that have left, at those, mm.
     on_tip : int
         The contact for which the tip speaks, or -1.
@@ -360,7 +392,9 @@ def move(
     sigma, immediate, node = setting[0], setting[8] > 0.0, setting[9] > 0.0
     ax, ay, depth, speed, travel, dt = pose[4], pose[5], pose[6], pose[7], pose[8], pose[9]
     kept = exp(-setting[4] * dt)
-    q, free, tip = np.empty((k, 2)), np.zeros((k, 2)), np.zeros(6)
+    q, free, tip = np.empty((k, 2)), np.zeros((k, 2)), np.zeros(12)
+    tip[6] = 1.0
+    tip[7:11] = pose[0:4]
     load(places, table, pose, setting, q)
     clearance = _clearance(pose[2], pose[3], walls, posts)
     push = 0.0
@@ -512,6 +546,8 @@ def spread(
         Square of the largest change since ``was`` at the nodes that may become contacts, mm^2.
     how : int
         0 no landmark of the tip, 1 interpolated, 2 evaluated directly.
+    reach : float
+        Largest displacement at those nodes, mm.
     """
     c, n, k = int(form[0]), points.shape[1], q.shape[0]
     N, rhs, Qc, kc = n * c, 2 // c, head - c, k * c
@@ -599,12 +635,14 @@ def spread(
                     yy -= line[2 * Q + a] * shares[a]
                 mesh[p, 0] += xx * sx + xy * sy
                 mesh[p, 1] += xy * sx + yy * sy
-    change = 0.0
+    change, reach = 0.0, 0.0
     for i in range(nodes.shape[0]):
         p = nodes[i]
-        dx, dy = mesh[p, 0] - was[p, 0], mesh[p, 1] - was[p, 1]
+        x, y = mesh[p, 0], mesh[p, 1]
+        dx, dy = x - was[p, 0], y - was[p, 1]
         change = max(change, dx * dx + dy * dy)
-    return mesh, change, how
+        reach = max(reach, x * x + y * y)
+    return mesh, change, how, sqrt(reach)
 
 
 @njit(**OPTIONS)
@@ -646,46 +684,87 @@ def value_before(
 
 
 @njit(**OPTIONS)
-def near_free(q: Any, free: Any, j: int) -> bool:
-    """Whether a contact that has left is so close to the field without it that it can go."""
-    dx, dy = q[j, 0] - free[j, 0], q[j, 1] - free[j, 1]
-    return sqrt(dx * dx + dy * dy) <= LET_GO
+def needle(
+    ex: float,
+    ey: float,
+    tx: float,
+    ty: float,
+    speed: float,
+    dt: float,
+    immediate: bool,
+    before: Any,
+    place: Any,
+) -> Any:
+    """The pose as the loops take it, with the travel since the last one (``before``: `TIP` and the last pose)."""
+    pose = np.empty(15)
+    depth = sqrt((tx - ex) ** 2 + (ty - ey) ** 2)
+    pose[0], pose[1], pose[2], pose[3] = ex, ey, tx, ty
+    pose[4] = pose[5] = 0.0
+    if depth >= ZERO_LENGTH:
+        pose[4], pose[5] = (tx - ex) / depth, (ty - ey) / depth
+    travel = depth
+    if before[6] > 0.0:
+        at_entry = sqrt((ex - before[7]) ** 2 + (ey - before[8]) ** 2)
+        at_tip = sqrt((tx - before[9]) ** 2 + (ty - before[10]) ** 2)
+        travel = max(at_entry, at_tip)
+    pose[6], pose[7], pose[8], pose[9] = depth, speed, inf if immediate else travel, dt
+    pose[10], pose[11], pose[12], pose[13], pose[14] = tx, ty, 1.0, 0.0, 0.0
+    if place.shape[0] > 0:
+        pose[10:15] = place
+    return pose
+
+
+@njit(**OPTIONS)
+def slots_of(table: Any, slot_of_source: Any) -> Any:
+    """Slot of each contact of a table, -1 for one that the response does not have."""
+    slots = np.empty(table.shape[0], dtype=np.int64)
+    for j in range(table.shape[0]):
+        slots[j] = slot_of_source[int(table[j, 0])]
+    return slots
+
+
+@njit(**OPTIONS)
+def allowed(table: Any, before: Any, q: Any, free: Any, pose: Any, setting: Any) -> Any:
+    """How far a node may move in this step (mm), and whether a contact that has left can go."""
+    longest = sqrt(before[3] * before[3] + before[4] * before[4]) if before[0] > 0.0 else 0.0
+    drops = False
+    for j in range(table.shape[0]):
+        longest = max(longest, sqrt(table[j, 2] * table[j, 2] + table[j, 3] * table[j, 3]))
+        if table[j, 1] == 0.0:
+            dx, dy = q[j, 0] - free[j, 0], q[j, 1] - free[j, 1]
+            drops = drops or sqrt(dx * dx + dy * dy) <= LET_GO
+    return CALM * (pose[8] + longest * -expm1(-setting[4] * pose[9])) + LET_GO, drops
 
 
 @njit(**OPTIONS)
 def step(
-    places: Any, nodes: Any, was: Any, contacts: Any, before: Any, pose: Any, setting: Any, walls: Any, posts: Any, form: Any,
-    frame: Any, anchors: Any, L_inverse: Any, sources: Any, felt: Any, slots: Any, slot_of_source: Any, count: int, P: Any,
-    points: Any, A: Any, rows: Any, single: Any, product: Any, head: int, square: Any, coefficients: Any, degree: int, toq: Any,
-    near: Any, rough: Any, marks: Any, alongs: Any
+    ex: float, ey: float, tx: float, ty: float, speed: float, dt: float, place: Any, places: Any, nodes: Any, was: Any,
+    contacts: Any, before: Any, setting: Any, walls: Any, posts: Any, form: Any, frame: Any, anchors: Any, L_inverse: Any,
+    sources: Any, felt: Any, slots: Any, slot_of_source: Any, count: int, P: Any, points: Any, A: Any, rows: Any, single: Any,
+    product: Any, head: int, square: Any, coefficients: Any, degree: int, toq: Any, near: Any, rough: Any, marks: Any,
+    alongs: Any
 ) -> Any:  # fmt: skip
-    """`touch`, `move` and `spread` in one call; ends after `touch` where contacts have to be added or dropped first."""
-    table = touch(places, nodes, was, contacts, pose, setting, marks, alongs)
+    """`touch`, `move` and `spread` in one call.
+
+    Returns
+    -------
+    outcome : int
+        `CONTACTS` have to be added or dropped first (the table says which), or `DONE`, or `NOT_YET`: the field moves
+        beyond the limit, or a contact can go.
+    table, tip, mesh
+        The new state.
+    how : int
+        As `spread` says.
+    """
+    pose = needle(ex, ey, tx, ty, speed, dt, setting[8] > 0.0, before, place)
+    table = touch(places, nodes, was, contacts, pose, setting, marks, alongs, before[11])
     k = table.shape[0]
+    slot_of = slots_of(table, slot_of_source)
     same = k == count
-    slot_of = np.empty(k, dtype=np.int64)
     for j in range(k):
-        slot_of[j] = slot_of_source[int(table[j, 0])]
         same = same and slot_of[j] >= 0
     if not same:
-        empty = np.empty((0, 2))
-        none = np.empty((0, 0))
-        return (
-            False,
-            table,
-            slot_of,
-            empty,
-            before,
-            empty,
-            -1,
-            0.0,
-            (none, none, none, none, none),
-            empty,
-            0.0,
-            0,
-            0.0,
-            0,
-        )
+        return CONTACTS, table, before, was, 0
     q, tip, free, on_tip, soft, quantities = move(
         table,
         before,
@@ -704,15 +783,12 @@ def step(
         slot_of,
         P,
     )
-    mesh, change, how = spread(
+    mesh, change, how, tip[11] = spread(
         form, frame, points, A, rows, single, product, head, slot_of, q, tip, on_tip, soft, quantities, square,
         coefficients, degree, toq, near, rough, nodes, was
     )  # fmt: skip
-    longest = sqrt(before[3] * before[3] + before[4] * before[4]) if before[0] > 0.0 else 0.0
-    drops = 0
-    for j in range(k):
-        longest = max(longest, sqrt(table[j, 2] * table[j, 2] + table[j, 3] * table[j, 3]))
-        if table[j, 1] == 0.0:
-            drops += near_free(q, free, j)
-    limit = CALM * (pose[8] + longest * -expm1(-setting[4] * pose[9])) + LET_GO
-    return True, table, slot_of, q, tip, free, on_tip, soft, quantities, mesh, change, how, limit, drops
+    limit, drops = allowed(table, before, q, free, pose, setting)
+    if change > limit * limit or drops:
+        return NOT_YET, table, before, was, how
+    table[:, 2:4] = q
+    return DONE, table, tip, mesh, how

@@ -30,7 +30,7 @@ ROWS_PER_STEP = 3
 
 Singles = NDArray[np.float32]
 Precision = Literal["single", "double"]
-NO_TIP = np.zeros(6)
+NO_TIP = np.zeros(12)
 Number = TypeVar("Number", bound=np.generic)
 Quantities = tuple[Floats, Floats, Floats, Floats, Floats]
 
@@ -284,7 +284,7 @@ class Response:
             Slots of the contacts.
         q : ndarray, shape (k, 2)
             Their displacements, mm.
-        tip : ndarray, shape (6,)
+        tip : ndarray, shape (12,)
             As `compiled_step.TIP`, mm.
         soft : float
             Softness of the tip's landmark.
@@ -305,7 +305,7 @@ class Response:
         was = np.empty((0, 2)) if was is None else was
         place = (tip[1:3] - s.centre) / s.scale
         quantities = self.at_point(place)
-        mesh, change, how = spread(
+        mesh, change, how, _ = spread(
             s.form, s.frame, s.columns, s.table, self.rows, self.single, self.product, self.head, slot_of, q, tip, on_tip,
             soft, quantities, self.square, COEFFICIENTS, DEGREE, self.toq, self.near, self.rough, nodes, was,
         )  # fmt: skip
