@@ -187,7 +187,7 @@ def at_point(
         G_pp less what the contacts explain.
     """
     c, b, m = int(form[0]), anchors.shape[0], L_inverse.shape[0]
-    felt_p, held_p = np.empty((c, m)), np.zeros((c, m))
+    felt_p, held_p = np.empty((c, m)), np.empty((c, m))
     for i in range(b):
         xx, xy, yy = kernel(form, x - anchors[i, 0], y - anchors[i, 1])
         felt_p[0, i] = xx
@@ -200,13 +200,14 @@ def at_point(
         felt_p[0, m - 3], felt_p[0, m - 2], felt_p[0, m - 1] = 1.0, 0.0, -y
         felt_p[1, m - 3], felt_p[1, m - 2], felt_p[1, m - 1] = 0.0, 1.0, x
     for a in range(c):
-        target = held_p[a]
-        for j in range(m):
-            w, line = felt_p[a, j], L_inverse[j]
-            for i in range(m):
-                target[i] += w * line[i]
+        one = felt_p[a]
+        for i in range(m):
+            line, value = L_inverse[i], 0.0
+            for j in range(m):
+                value += one[j] * line[j]
+            held_p[a, i] = value
     kc = k * c
-    cross, h, own = np.empty((c, kc)), np.zeros((c, kc)), np.empty((c, c))
+    cross, h, own = np.empty((c, kc)), np.empty((c, kc)), np.empty((c, c))
     for j in range(k):
         s = slots[j]
         xx, xy, yy = kernel(form, x - sources[s, 0], y - sources[s, 1])
@@ -218,11 +219,12 @@ def at_point(
                     value += f[t] * g[t]
                 cross[a, j * c + e] = (xx if a + e == 0 else (yy if a + e == 2 else xy)) - value
     for a in range(c):
-        target = h[a]
-        for j in range(kc):
-            w, line = cross[a, j], P[j]
-            for i in range(kc):
-                target[i] += w * line[i]
+        one = cross[a]
+        for i in range(kc):
+            line, value = P[i], 0.0  # P is symmetric
+            for j in range(kc):
+                value += one[j] * line[j]
+            h[a, i] = value
     xx, xy, yy = kernel(form, 0.0, 0.0)
     for a in range(c):
         for e in range(c):
@@ -550,7 +552,7 @@ def spread(
         Largest displacement at those nodes, mm.
     """
     c, n, k = int(form[0]), points.shape[1], q.shape[0]
-    N, rhs, Qc, kc = n * c, 2 // c, head - c, k * c
+    rhs, Qc, kc = 2 // c, head - c, k * c
     own_q = q
     if on_tip >= 0:
         own_q = q.copy()
@@ -603,20 +605,28 @@ def spread(
     for s in range(kc):
         for e in range(rhs):
             weights[e, head + s] = W[s, e]
-    out = np.zeros((rhs, N), dtype=product.dtype)
     # rows in use: all of the patch and not the direct one, or the direct one and not the patch, or contacts alone
     first = Qc if how == 2 else head
     rest = weights[:, first : head + kc].copy()
-    for start in range(0, N, CHUNK):
-        stop = min(N, start + CHUNK)
-        if how == 1:
-            add_range(out, start, weights, 0, Qc, product, start, stop)
-        add_range(out, start, rest, first, head + kc - first, product, start, stop)
     mesh = np.empty((n, 2))
-    flat = out.reshape(2, n)
-    for i in range(n):
-        mesh[i, 0] = flat[0, i]
-        mesh[i, 1] = flat[1, i]
+    flat = mesh.reshape(2 * n)
+    out = np.empty((rhs, CHUNK), dtype=product.dtype)
+    for e in range(c):
+        for begin in range(0, n, CHUNK):
+            w = min(n, begin + CHUNK) - begin
+            out[:, :] = 0.0
+            start = e * n + begin
+            if how == 1:
+                add_range(out, 0, weights, 0, Qc, product, start, start + w)
+            add_range(out, 0, rest, first, head + kc - first, product, start, start + w)
+            if c == 1:
+                x, y, block = out[0], out[1], flat[2 * begin : 2 * (begin + w)]
+                for i in range(w):
+                    block[2 * i] = x[i]
+                    block[2 * i + 1] = y[i]
+            else:
+                for i in range(w):
+                    mesh[begin + i, e] = out[0, i]
     if how == 1:
         Q = shares.shape[0]
         for i in range(near.shape[0]):

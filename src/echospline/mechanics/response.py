@@ -28,6 +28,9 @@ RESIDUAL = 1e-6
 ROWS_PER_STEP = 3
 """How many rows of a new patch one step builds: the patch is ready after seven steps, and no step takes long."""
 
+LINE = 64
+"""Bytes in a cache line."""
+
 Singles = NDArray[np.float32]
 Precision = Literal["single", "double"]
 NO_TIP = np.zeros(12)
@@ -101,7 +104,8 @@ class Response:
         self.inverse: Floats = np.empty((0, 0))
         self.gram: Floats = np.empty((0, 0))
         self.toq: Floats = np.empty((0, c * len(NODES)))
-        self.rows: Floats = np.empty((0, c * len(scene.points)))
+        # rows as long as whole cache lines, so that all of them begin on one; what is beyond the points stays unused
+        self.rows: Floats = np.empty((0, -(-c * len(scene.points) * 4 // LINE) * LINE // 4))
         self.single: Singles = np.empty(self.rows.shape, dtype=np.float32)
         self.product: Floats | Singles = self.rows
         self._reserve(32)
@@ -334,6 +338,10 @@ class Response:
 
 
 def _grown(array: NDArray[Number], shape: tuple[int, ...]) -> NDArray[Number]:
-    grown = np.zeros(shape, dtype=array.dtype)
+    """Return a larger array of zeros that begins with this one, on the boundary of a cache line."""
+    size = int(np.prod(shape)) * array.itemsize
+    room = np.zeros(size + LINE, dtype=np.uint8)
+    start = -room.ctypes.data % LINE
+    grown = room[start : start + size].view(array.dtype).reshape(shape)
     grown[tuple(slice(n) for n in array.shape)] = array
     return grown
