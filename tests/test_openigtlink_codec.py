@@ -40,7 +40,7 @@ def sealed(kind: str, body: bytes, version: int = 1) -> bytes:
 
 
 def test_the_golden_bytes_are_there() -> None:
-    assert len(GOLDEN) == 14
+    assert len(GOLDEN) == 15
 
 
 def test_check_sum_has_the_catalogued_value_of_crc_64_ecma_182() -> None:
@@ -140,6 +140,14 @@ def test_points_and_mesh_of_the_reference_library_are_read() -> None:
         0,
     )
     np.testing.assert_array_equal(displacement.values, np.arange(12).reshape(4, 3) / 2)
+    np.testing.assert_array_equal(strain.values, [[-1], [0], [1], [2]])
+
+
+def test_names_of_odd_length_are_padded_as_the_reference_library_pads_them() -> None:
+    mesh = one(GOLDEN["PolyDataOdd"]).content
+    assert isinstance(mesh, PolyData)
+    (strain,) = mesh.attributes
+    assert strain.name == "strain"
     np.testing.assert_array_equal(strain.values, [[-1], [0], [1], [2]])
 
 
@@ -335,7 +343,7 @@ MALFORMED = {
     "metadata index of 65535 entries": ("STATUS", struct.pack(">HHII", 12, 2, 0, 0) + b"\xff\xff", 2),
     "metadata entry beyond the body": (
         "STATUS",
-        struct.pack(">HHII", 12, 10, 0, 0) + struct.pack(">HHHI", 1, 9, 3, 9),
+        struct.pack(">HHII", 12, 10, 3, 0) + Status().pack() + struct.pack(">HHHI", 1, 2, 3, 9) + b"key",
         2,
     ),
     "body shorter than its extended header": ("STATUS", bytes(11), 2),

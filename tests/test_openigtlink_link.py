@@ -154,6 +154,35 @@ def test_a_peer_that_does_not_read_delays_nobody_and_gets_the_newest_when_it_doe
     run(scene)
 
 
+def test_what_waits_for_a_slow_peer_waits_in_its_slot_not_in_a_queue() -> None:
+    async def scene() -> None:
+        async with serving(LinkLimits(patience=Patience(buffer=8192))) as (link, port, _):
+            slow = await client(port, 4096)
+            await until(lambda: len(link.peers) == 1)
+            for level in range(200):
+                link.publish(picture(level, 64))
+            (peer,) = link.peers
+            assert peer._transport is not None
+            assert peer._transport.get_write_buffer_size() <= len(encode(picture(0, 64)))
+            assert peer.skipped > 100
+            slow.writer.close()
+
+    run(scene)
+
+
+def test_a_burst_before_a_silence_is_received_whole() -> None:
+    async def scene() -> None:
+        async with serving() as (_, port, inbox):
+            peer = await client(port)
+            peer.send(picture(5), *[GOLDEN["Status"]] * 100)
+            await until(lambda: len(inbox.messages) == 101)
+            content = inbox.messages[0].content
+            assert isinstance(content, Image)
+            assert (content.voxels == 5).all()
+
+    run(scene)
+
+
 def test_a_flood_of_messages_from_one_peer_leaves_room_for_another() -> None:
     async def scene() -> None:
         async with serving() as (link, port, inbox):
@@ -269,6 +298,35 @@ def test_the_system_is_told_to_find_half_open_connections() -> None:
                 interval = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL)
                 assert idle + 4 * interval <= 12
             peer.writer.close()
+
+    run(scene)
+
+
+@pytest.mark.parametrize("talking", [False, True], ids=["while nothing is said", "while images go out"])
+def test_a_peer_that_vanishes_without_a_word_is_found(talking: bool) -> None:
+    """As when its machine is switched off and on: no FIN, no RST, until keep-alive or an image finds nobody there."""
+
+    async def scene() -> None:
+        async with serving(LinkLimits(patience=Patience(lost=3.0))) as (link, port, _):
+            gone, stays = await client(port), await client(port)
+            await until(lambda: len(link.peers) == 2)
+            connection = gone.writer.get_extra_info("socket")
+            repair = 19  # TCP_REPAIR of linux/tcp.h: a socket in repair closes in silence
+            try:
+                connection.setsockopt(socket.IPPROTO_TCP, repair, 1)
+            except OSError as error:
+                pytest.skip(
+                    f"a socket cannot be made to vanish here: {error.strerror} (it takes CAP_NET_ADMIN)"
+                )
+            gone.writer.transport.abort()
+            await asyncio.sleep(0.2)
+            assert len(link.peers) == 2  # nobody has noticed yet: it was silent indeed
+            if talking:
+                link.publish(picture(1))
+            await until(lambda: len(link.peers) == 1)
+            link.publish(picture(2))
+            while (await stays.next()).timestamp != 2:
+                pass
 
     run(scene)
 

@@ -140,6 +140,10 @@ static int golden(const std::string &folder) {
   mesh->AddAttribute(strain);
   write(folder, "PolyData", mesh);
 
+  mesh->ClearAttributes();  // with names of an odd length, which the protocol pads
+  mesh->AddAttribute(strain);
+  write(folder, "PolyDataOdd", mesh);
+
   igtl::NDArrayMessage::Pointer array = igtl::NDArrayMessage::New();
   igtl::Array<igtlFloat64> numbers;
   std::vector<igtlUint16> size;
