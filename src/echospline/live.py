@@ -15,6 +15,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from echospline.deformation import Deformation
 from echospline.errors import InputError
 from echospline.grid import Floats, as_points
 from echospline.mechanics.model import TissueModel
@@ -478,8 +479,8 @@ class LiveEngine:
             raise ArithmeticError("the displacement is not finite")
         offered = getattr(self._model, "spline", None)
         watched = self._watch
-        if len(watched):
-            watched = watched + self._model.displacement_at(self._state, watched)
+        if len(watched):  # as the picture shows them: bilinear between nodes
+            watched = Deformation(self._model.grid, displacement).forward(watched)
         return Snapshot(
             step=self._steps,
             time=self._time,

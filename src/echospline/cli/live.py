@@ -56,6 +56,13 @@ def live(
     port: Annotated[int, typer.Option(min=0, max=65535, help="port; 0 takes any free one")] = 8750,
     rate: Annotated[float, typer.Option(min=10, max=1000, help="model steps per second")] = 120.0,
     clients: Annotated[int, typer.Option(min=1, max=1000, help="most pages at once")] = 64,
+    nodes: Annotated[
+        bool,
+        typer.Option(
+            "--nodes/--splines",
+            help="send every node's displacement even for tps and elastic: less work here, more bytes, the mesh as drawn",
+        ),
+    ] = False,
     sessions: Annotated[
         Path | None,
         typer.Option(help="file that keeps training sessions; by default in the user's data folder"),
@@ -87,7 +94,7 @@ def live(
     scenario, folder = scenario_from(source, changes or {})
     image = scenario.read_image(folder)
     scene = scene_of(scenario, image, folder)
-    settings = Settings(host, port, rate, clients)
+    settings = Settings(host, port, rate, clients, nodes=nodes)
     kept = Sessions(sessions or default_sessions())
     app = build_app(scene, kept, settings, opener_for(scenario))
     console = Console(stderr=True)

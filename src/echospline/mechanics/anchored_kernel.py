@@ -179,10 +179,13 @@ class AnchoredKernel:
         """[U_yB P_y] of conditioned sources (m, 2), shape (m c, b c + p)."""
         return _felt(self.kernel, sources, self.anchors)
 
-    def spline(self, sources: Floats, weights: Floats) -> Spline:
-        """Return the field of weights (m c, 2 / c) at conditioned sources, anchors included, for any point."""
+    def spline(self, sources: Floats, weights: Floats, coupling: Floats | None = None) -> Spline:
+        """Return the field of weights (m c, 2 / c) at conditioned sources, anchors included, for any point.
+
+        ``coupling`` is that of the sources, where it is known already.
+        """
         c = self.components
-        held = -self.coupling(sources) @ weights
+        held = -(self.coupling(sources) if coupling is None else coupling) @ weights
         split = len(self.anchors) * c
         mobile = weights if c == 1 else blocks(weights)
         anchors = held[:split]

@@ -327,14 +327,17 @@ class Response:
         d = np.zeros((self.count, 2))
         d[slot_of] = own
         d = d if c == 1 else d.reshape(-1, 1)
-        weights, where = self.inverse[:n, :n] @ d, s.sources[self.slots[: self.count]]
+        slots = self.slots[: self.count]
+        weights, where = self.inverse[:n, :n] @ d, s.sources[slots]
+        coupling = s.held[(c * slots[:, None] + np.arange(c)).ravel()].T
         if tip[0] > 0 and on_tip < 0:
             place = (tip[1:3] - s.centre) / s.scale
             _, _, _, h, free = self.at_point(place)
             gap = tip[3:5].reshape(c, 2 // c) - h @ d
             w = np.linalg.solve(free + soft * np.eye(c), gap)
             weights, where = np.vstack([weights - h.T @ w, w]), np.vstack([where, place])
-        return s.spline(where, weights)
+            coupling = np.hstack([coupling, s.coupling(place[None])])
+        return s.spline(where, weights, coupling)
 
 
 def _grown(array: NDArray[Number], shape: tuple[int, ...]) -> NDArray[Number]:

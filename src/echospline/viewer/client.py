@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,6 +28,9 @@ IN_FLIGHT = 2
 """Frames sent and not yet drawn; with two, one is on its way while the other is drawn."""
 PLOT_POINTS = 400
 """Points of the summary's plot."""
+FASTEST_DISPLAY, AHEAD = 1 / 60, 0.008
+"""s; a frame is sent this long before the page draws again, as its reports foretell, and not sooner: a snapshot
+sent at once would be old by then, and a second one would have to follow it."""
 STILL, KEEP_ALIVE = 5e-4, 0.1
 """mm and s: while nothing moves further than that from the picture shown, frames come only this often."""
 HISTORY = 50
@@ -71,13 +75,17 @@ class Client:
         The engine; this client runs it while it is connected.
     sessions : Sessions
         Where finished exercises go.
+    nodes : bool
+        Send node displacements even where the model offers a spline.
     """
 
-    def __init__(self, socket: WebSocket, seat: Seat, sessions: Sessions) -> None:
+    def __init__(self, socket: WebSocket, seat: Seat, sessions: Sessions, *, nodes: bool = False) -> None:
+        self._nodes = nodes
         self.socket, self.seat, self.sessions = socket, seat, sessions
         self._sent = self._drawn = self._number = 0
         self._credit, self._sending = asyncio.Event(), asyncio.Lock()
         self._commands, self._requests = Allowance(400, 400), Allowance(20, 40)
+        self._reported, self._intervals = 0.0, deque([FASTEST_DISPLAY], maxlen=16)
         self._failure: str | None = None
         self._credit.set()
 
@@ -134,6 +142,10 @@ class Client:
             )
         if command.number <= self._number:
             raise protocol.ProtocolError(f"command numbers ascend; got {command.number} after {self._number}")
+        if command.drawn > self._drawn:
+            now = asyncio.get_running_loop().time()
+            self._intervals.append(now - self._reported)
+            self._reported = now
         self._drawn, self._number = command.drawn, command.number
         if self._sent - self._drawn < IN_FLIGHT:
             self._credit.set()
@@ -242,6 +254,8 @@ class Client:
         loop = asyncio.get_running_loop()
         while True:
             await self._credit.wait()
+            refresh = min(FASTEST_DISPLAY, *self._intervals)
+            await asyncio.sleep(max(0.0, self._reported + refresh - AHEAD - loop.time()))
             number, snapshot = await self._newer_than(number)
             if shown is not None and loop.time() - shown_at < KEEP_ALIVE and is_still(shown, snapshot):
                 continue
@@ -258,6 +272,7 @@ class Client:
                 snapshot,
                 self._sent,
                 recording=training is not None and training.session is None,
+                nodes=self._nodes,
             )
             async with self._sending:
                 await self.socket.send_bytes(data)

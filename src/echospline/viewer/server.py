@@ -64,6 +64,8 @@ class Settings:
         Most pages at once.
     token : str or None
         What a page must present; made up when the host is not loopback and none is given.
+    nodes : bool
+        Send the displacement of every node even where the model is a spline: less work for the server, more bytes.
     """
 
     host: str = "127.0.0.1"
@@ -71,6 +73,7 @@ class Settings:
     rate: float = 120.0
     clients: int = 64
     token: str | None = None
+    nodes: bool = False
 
     def __post_init__(self) -> None:
         if not 0 <= self.port <= 65535:
@@ -356,7 +359,7 @@ async def _live(websocket: WebSocket) -> None:
         seat, resumed = await asyncio.to_thread(room.take_seat, key, name, scene)
         room.taken.append(seat)
         try:
-            await Client(websocket, seat, room.sessions).serve(resumed)
+            await Client(websocket, seat, room.sessions, nodes=room.settings.nodes).serve(resumed)
         finally:
             room.taken.remove(seat)
             if _KEY.fullmatch(key):
