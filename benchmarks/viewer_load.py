@@ -30,6 +30,25 @@ FRAME = 1 / 60
 TICKS = os.sysconf("SC_CLK_TCK") if hasattr(os, "sysconf") else 100
 
 
+class Span:
+    """What is measured: it begins a second after every client has its first frame (models are built by then)."""
+
+    def __init__(self, clients: int, seconds: float) -> None:
+        self.missing, self.seconds, self.all_here = clients, seconds, asyncio.Event()
+        self.start = self.end = float("inf")
+
+    def here(self) -> None:
+        self.missing -= 1
+        if not self.missing:
+            self.start = time.perf_counter() + 1.0
+            self.end = self.start + self.seconds
+            self.all_here.set()
+
+    async def wait(self) -> None:
+        async with asyncio.timeout(120):
+            await self.all_here.wait()
+
+
 class Client:
     """One page."""
 
@@ -39,30 +58,34 @@ class Client:
         self.latencies: list[float] = []
         self.bytes = self.asleep = 0
 
-    async def run(
-        self, address: str, start: float, end: float, *, sleeps: float = 0.0, dead: bool = False
-    ) -> None:
-        async with connect(f"ws{address[4:]}live", compression=None, max_size=None) as socket:
+    async def run(self, address: str, span: Span, *, sleeps: float = 0.0, dead: bool = False) -> None:
+        self.span = span
+        async with connect(
+            f"ws{address[4:]}live", compression=None, max_size=None, open_timeout=60
+        ) as socket:
             reader = asyncio.create_task(self._read(socket))
             try:
                 if dead:
-                    await asyncio.sleep(end - time.perf_counter())
+                    await span.wait()
+                    await asyncio.sleep(span.end - time.perf_counter())
                     return
-                await self._draw(socket, start, end, sleeps)
+                await self._draw(socket, span, sleeps)
             finally:
                 reader.cancel()
 
     async def _read(self, socket) -> None:
         async for message in socket:
             if isinstance(message, bytes):
+                if not self.received:
+                    self.span.here()
                 self.newest, self.received = message, self.received + 1
                 self.bytes += len(message)
 
-    async def _draw(self, socket, start: float, end: float, sleeps: float) -> None:
+    async def _draw(self, socket, span: Span, sleeps: float) -> None:
         number, last, due = 0, 0, time.perf_counter() + self.phase * FRAME
         slept = False
-        while (now := time.perf_counter()) < end:
-            if sleeps and not slept and now > (start + end) / 2:
+        while (now := time.perf_counter()) < span.end:
+            if sleeps and not slept and now > (span.start + span.end) / 2:
                 before, slept = self.received, True
                 await asyncio.sleep(sleeps)
                 self.asleep, now = self.received - before, time.perf_counter()
@@ -70,7 +93,7 @@ class Client:
             if self.newest is not None:
                 frame = decode_frame(self.newest)
                 drawn = frame.number
-                if drawn != last and now > start:
+                if drawn != last and now > span.start:
                     self.drawn_times.append(now)
                     if frame.sent:
                         self.latencies.append(now - frame.sent)
@@ -89,17 +112,17 @@ def processor_seconds(pid: int) -> float:
 
 
 async def measure(address: str, pid: int, count: int, seconds: float) -> dict[str, float]:
-    begun = time.perf_counter()
-    start, end = begun + 1.5, begun + 1.5 + seconds
     clients = [Client(k / max(count, 1)) for k in range(count)]
     slow, dead = Client(0.3), Client(0.6)
-    jobs = [client.run(address, start, end) for client in clients]
-    jobs += [slow.run(address, start, end, sleeps=2.0), dead.run(address, start, end, dead=True)]
+    span = Span(len(clients) + 2, seconds)
+    jobs = [client.run(address, span) for client in clients]
+    jobs += [slow.run(address, span, sleeps=2.0), dead.run(address, span, dead=True)]
 
     async def watch() -> float:
-        await asyncio.sleep(start - time.perf_counter())
+        await span.wait()
+        await asyncio.sleep(span.start - time.perf_counter())
         before = processor_seconds(pid)
-        await asyncio.sleep(end - time.perf_counter())
+        await asyncio.sleep(span.end - time.perf_counter())
         return (processor_seconds(pid) - before) / seconds
 
     used, *_ = await asyncio.gather(watch(), *jobs)
@@ -127,7 +150,7 @@ def main() -> None:
     parser.add_argument("--mesh", default="40x30")
     parser.add_argument("--seconds", type=float, default=8.0, help="measured for each count, at most 60")
     parser.add_argument("--rate", default="120", help="model steps per second")
-    parser.add_argument("--nodes", action="store_true", help="node displacements instead of splines")
+    parser.add_argument("--wire", choices=("automatic", "nodes", "splines"), default="automatic")
     parser.add_argument("--json", type=Path, help="write the rows here too")
     options = parser.parse_args()
     counts = [min(int(text), 128) for text in options.clients.split(",")]
@@ -135,7 +158,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "echospline", "live", "--no-browser", "--port", "0", "--model", options.model,
                    "--mesh", options.mesh, "--rate", options.rate, "--clients", "256",
-                   "--sessions", f"{folder}/sessions.sqlite", "--nodes" if options.nodes else "--splines"]  # fmt: skip
+                   "--sessions", f"{folder}/sessions.sqlite"]  # fmt: skip
+        command += [] if options.wire == "automatic" else [f"--{options.wire}"]
         server = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
         try:
             assert server.stderr is not None

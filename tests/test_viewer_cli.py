@@ -66,7 +66,7 @@ def kept(tmp_path):
 
 
 def test_live_serves_the_page_and_the_real_model_and_ends_when_told(tmp_path):
-    command = [sys.executable, "-m", "echospline", "live", "--no-browser", "--port", "0", "--mesh", "12x9",
+    command = [sys.executable, "-m", "echospline", "live", "--no-browser", "--port", "0", "--mesh", "12x9", "--splines",
                "--sessions", str(tmp_path / "deep" / "kept.sqlite")]  # fmt: skip
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         try:

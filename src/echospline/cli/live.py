@@ -57,12 +57,14 @@ def live(
     rate: Annotated[float, typer.Option(min=10, max=1000, help="model steps per second")] = 120.0,
     clients: Annotated[int, typer.Option(min=1, max=1000, help="most pages at once")] = 64,
     nodes: Annotated[
-        bool,
+        bool | None,
         typer.Option(
             "--nodes/--splines",
-            help="send every node's displacement even for tps and elastic: less work here, more bytes, the mesh as drawn",
+            help="what is sent for tps and elastic: every node's displacement (9.6 kB for 1200), or the spline's "
+            "weights (2 kB, more work here, a smooth picture on any mesh); by default weights above 4000 nodes",
+            show_default=False,
         ),
-    ] = False,
+    ] = None,
     sessions: Annotated[
         Path | None,
         typer.Option(help="file that keeps training sessions; by default in the user's data folder"),

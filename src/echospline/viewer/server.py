@@ -64,8 +64,8 @@ class Settings:
         Most pages at once.
     token : str or None
         What a page must present; made up when the host is not loopback and none is given.
-    nodes : bool
-        Send the displacement of every node even where the model is a spline: less work for the server, more bytes.
+    nodes : bool or None
+        Send the displacement of every node even where the model is a spline; None decides by the mesh's size.
     """
 
     host: str = "127.0.0.1"
@@ -73,7 +73,7 @@ class Settings:
     rate: float = 120.0
     clients: int = 64
     token: str | None = None
-    nodes: bool = False
+    nodes: bool | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.port <= 65535:
