@@ -6,6 +6,7 @@ import sys
 
 import typer
 
+from echospline.cli.bench import bench
 from echospline.cli.dataset import dataset
 from echospline.cli.exvivo import exvivo
 from echospline.cli.identify import identify
@@ -33,6 +34,7 @@ app = typer.Typer(
 app.command()(simulate)
 app.command()(demo)
 app.command()(info)
+app.command()(bench)
 app.command()(identify)
 studies = typer.Typer()
 studies.callback(invoke_without_command=True)(study)

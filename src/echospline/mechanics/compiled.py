@@ -210,7 +210,7 @@ def compile_ahead(
     try_out : callable
         Calls every loop once with the types that the simulation uses.
     report : callable, optional
-        Gets one sentence if this takes longer than a second: then the machine compiles. A warning of the logger
+        Gets one sentence if this takes longer than three seconds: then the machine compiles. A warning of the logger
         "echospline" when not given.
 
     Returns
@@ -223,7 +223,7 @@ def compile_ahead(
             return 0.0
         say = log.warning if report is None else report
         timer = threading.Timer(
-            1.0, say, args=("compiling the fast step for this machine, once: half a minute or less",)
+            3.0, say, args=("compiling the fast step for this machine, once: half a minute or less",)
         )
         timer.daemon = True
         begin = time.perf_counter()

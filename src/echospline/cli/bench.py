@@ -1,0 +1,51 @@
+"""``echospline bench``: how fast a step and a frame are on this machine."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+from threadpoolctl import threadpool_limits
+
+from echospline.bench import run
+
+
+def bench(
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print JSON rows (times in ms) instead of a table.")
+    ] = False,
+) -> None:
+    """Time steps and frames on this machine, against the display's 60 Hz and the haptic 1 kHz; under a minute."""
+    say = Console(stderr=True, highlight=False)
+    with say.status("…") as status, threadpool_limits(1):
+        rows = run(status.update)
+    if as_json:
+        print(json.dumps([row.as_json() for row in rows], indent=2))
+        return
+    table = Table(box=None, pad_edge=False, title="times in ms; step: from needle pose to mesh displacement")
+    table.add_column("what", no_wrap=True)
+    for name in ("nodes", "median", "p99", "per s", "x limit", "60 Hz", "1 kHz"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for row in rows:
+        frame = row.name == "frame"
+        table.add_row(
+            row.name,
+            f"{row.nodes}",
+            f"{row.median_ms:.3f}",
+            f"{row.p99_ms:.3f}",
+            f"{1000 / row.median_ms:.0f}",
+            "-" if frame else f"{row.ratio_to_limit:.1f}",
+            "yes" if row.p99_ms < 1000 / 60 else "no",
+            "-" if frame else ("yes" if row.p99_ms < 1 else "no"),
+        )
+    console = Console(highlight=False)
+    console.print(table)
+    console.print(
+        "60 Hz, 1 kHz: whether 99 of 100 fit. x limit: median against the bare float32\n"
+        "product of the landmarks and the mesh, which is one read of the response.\n"
+        "frame: step, inverse map and warp of 512 x 512 pixels.",
+        markup=False,
+    )
