@@ -194,3 +194,12 @@ def test_a_video_with_a_hole_in_its_middle_is_refused(tmp_path: Path, codec: str
     (tmp_path / "b").write_bytes(data)
     with pytest.raises(InputError, match=r"cut short|damaged"):
         read(tmp_path / "b", spacing=(0.1, 0.1))
+
+
+def test_a_comment_in_another_encoding_does_not_stop_the_reader(tmp_path: Path) -> None:
+    with open_writer(tmp_path / "a.mp4", GRID, 20) as writer:
+        writer.add(moving(1)[0], 0.0)
+    data = (tmp_path / "a.mp4").read_bytes()
+    assert data.count(b"echospline") == 1
+    (tmp_path / "b.mp4").write_bytes(data.replace(b"echospline", b"\xe9\xe8hospline"))
+    assert read(tmp_path / "b.mp4", spacing=(0.1, 0.1)).frames.shape == (1, 32, 48)

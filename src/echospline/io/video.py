@@ -17,6 +17,8 @@ from echospline.io.tag import tagged_spacing
 
 _DEMUXERS = {"MP4": "mov", "QuickTime": "mov", "AVI": "avi", "Matroska": "matroska", "WebM": "matroska"}
 """The one demuxer tried for each format: others of FFmpeg's follow references to other files."""
+_LENIENT: dict[str, Any] = {"metadata_errors": "replace"} if int(av.__version__.split(".")[0]) < 19 else {}
+"""Before PyAV 19 a comment in another encoding would make the whole file unreadable."""
 _SMALLEST_GUARD = 2**22
 """Pixels a decoder may always use: some begin with a size of their own and take the stream's afterwards."""
 
@@ -80,7 +82,7 @@ def open_video(path: Path, format: str, limit: float) -> Recording:
 
 
 def _opened(path: Path, format: str) -> Any:
-    return av.open(str(path), format=_DEMUXERS[format], metadata_errors="replace")
+    return av.open(str(path), format=_DEMUXERS[format], **_LENIENT)
 
 
 def _timed(container: Any, stream: Any) -> tuple[Floats | None, int]:
