@@ -40,4 +40,4 @@ format: setup
 	$(BIN)/ruff check --fix .
 
 clean:
-	rm -rf $(VENV) out build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
+	rm -rf $(VENV) node_modules out build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
