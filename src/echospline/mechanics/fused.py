@@ -30,6 +30,7 @@ from echospline.mechanics.compiled_step import (
 )
 from echospline.mechanics.interaction import LET_GO, largest_share
 from echospline.mechanics.kernels import ThinPlate
+from echospline.mechanics.pixel_field import PixelField
 from echospline.mechanics.response import NO_TIP, Precision, Quantities, Response
 from echospline.mechanics.spline import Spline
 from echospline.mechanics.tip_patch import COEFFICIENTS, DEGREE, HALF_WIDTH
@@ -217,14 +218,26 @@ class FusedStep:
         nearest = int(distance.argmin())
         return nearest if distance[nearest] <= SAME_PLACE else -1
 
+    def fine(self, state: FusedState, field: PixelField) -> Floats:
+        """Displacement of a fine mesh, shape (n, 2) mm."""
+        with self.lock:
+            slot_of = self.response.set_contacts(state.landmarks[:, 0].astype(np.int64))
+            on_tip = self._on_tip(state.landmarks, state.tip)
+            q = np.ascontiguousarray(state.landmarks[:, 2:4])
+            return field(self.response, state.mesh, slot_of, q, state.tip, self._soft(state), on_tip)
+
+    def _soft(self, state: FusedState) -> float:
+        """Softness of a state's tip landmark."""
+        if self.setting.tip_softness is None or not state.tip[0]:
+            return 0.0
+        return self.setting.tip_softness((float(state.tip[1]), float(state.tip[2])))
+
     def spline(self, state: FusedState) -> Spline | None:
         """Return the field of a state as a spline, in double precision; None where nothing is displaced."""
         if not len(state.landmarks) and not state.tip[0]:
             return None
         with self.lock:
-            soft = 0.0
-            if self.setting.tip_softness is not None and state.tip[0] > 0.0:
-                soft = self.setting.tip_softness((float(state.tip[1]), float(state.tip[2])))
+            soft = self._soft(state)
             slot_of = self.response.set_contacts(state.landmarks[:, 0].astype(np.int64))
             on_tip = self._on_tip(state.landmarks, state.tip)
             return self.response.spline(slot_of, state.landmarks[:, 2:4], state.tip, soft, on_tip)

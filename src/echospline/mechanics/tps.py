@@ -32,6 +32,7 @@ from echospline.mechanics.interaction import (
 )
 from echospline.mechanics.kernels import Kernel, ThinPlate
 from echospline.mechanics.landmarks import Clamps, contact_lattice
+from echospline.mechanics.pixel_field import FINE, PixelField
 from echospline.mechanics.response import Precision, Response
 from echospline.mechanics.spline import Spline, factor
 from echospline.needle import ZERO_LENGTH, NeedlePose
@@ -226,6 +227,7 @@ class TPSModel:
             if not (k > 0).all():
                 raise InputError(f"every stiffness must be positive (or infinite); got {k.min()}")
             self.stiffness = k
+        self.pixels: PixelField | None = None
         self.fast = self._fused(precision) if solver == "response" else None
 
     def rest(self) -> State:
@@ -235,7 +237,7 @@ class TPSModel:
     def displacement(self, state: State) -> Floats:
         """Displacement of the mesh nodes, shape (n, 2), mm."""
         if isinstance(state, FusedState):
-            return state.mesh
+            return state.mesh if self.pixels is None else self._fast().fine(state, self.pixels)
         return self.displacement_at(state, self.grid.nodes)
 
     def displacement_at(self, state: State, points: ArrayLike) -> Floats:
@@ -305,7 +307,13 @@ class TPSModel:
     def _fused(self, precision: Precision) -> FusedStep:
         """Build the fast solver of this scene."""
         p, nodes = self.parameters, self.grid.nodes
-        scene = AnchoredKernel.factor(self.kernel, self.anchors, nodes, sources=nodes[self.lattice])
+        sources, at, points = nodes[self.lattice], self.lattice, nodes
+        if self.grid.size > FINE:
+            points = PixelField.points(self.grid, sources)
+            at = len(points) - len(sources) + np.arange(len(sources))
+        scene = AnchoredKernel.factor(self.kernel, self.anchors, points, sources=sources)
+        if self.grid.size > FINE:
+            self.pixels = PixelField(self.grid, scene)
         softness = None if self.stiffness is None else scene.compliance(self.stiffness[self.lattice])
         x0, x1, y0, y1 = self.grid.extent
         walls = {"left": x0, "right": x1, "top": y0, "bottom": y1}
@@ -319,7 +327,7 @@ class TPSModel:
             self._node_place if p.tip == "node" else None,
             None if self.stiffness is None else lambda point: self._softness(scene, point),
         )
-        return FusedStep(Response(scene, self.lattice, precision, softness), setting)
+        return FusedStep(Response(scene, at, precision, softness), setting)
 
     def _fast(self) -> FusedStep:
         if self.fast is None:
