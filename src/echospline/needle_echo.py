@@ -30,6 +30,8 @@ OUTER_DIAMETER = {
 COPIES = 5
 COPY_LOSS = 0.65
 """Reverberations drawn, and how much each is fainter than the one before."""
+NOTHING = 40.0
+"""Exponent beyond which exp(-x) is below 1e-17 and is not computed."""
 FAR_WALL = 0.6
 """Echo of the tube's far wall relative to its near wall."""
 
@@ -213,7 +215,7 @@ def _light(s: Any, d: Any, facing: Any, drop: Any, length: Any, looks: Any) -> A
     mirror = exp(-((tilt / fade) ** 2))
     strength = floor + (1 - floor) * mirror
     light = 0.0
-    if shaft:
+    if shaft and abs(d) - radius < 6.5 * (width + radius):
         u = length - s  # uneven brightness, fixed to the needle
         grain = 0.88 + 0.12 * sin(2.1 * u) * sin(0.73 * u + 1.0)
         walls = exp(-(((d + radius) / width) ** 2)) + FAR_WALL * exp(-(((d - radius) / width) ** 2))
@@ -223,9 +225,10 @@ def _light(s: Any, d: Any, facing: Any, drop: Any, length: Any, looks: Any) -> A
         spacing = max(2 * radius, 3 * width)
         for k in range(1, COPIES + 1):
             shift = (k + 1) * spacing  # the far wall is the first of the series
-            copy = exp(-(((d + radius - shift * facing) / width) ** 2)) * _ends(
-                s - shift * drop, length, width
-            )
+            off = (d + radius - shift * facing) / width
+            if off * off > NOTHING:  # a point lies near one copy or none: most of the work is not to be done
+                continue
+            copy = exp(-(off * off)) * _ends(s - shift * drop, length, width)
             light += 0.8 * COPY_LOSS**k * strength * mirror * copy
     if tip:
         r2 = (s - length) ** 2 + d * d
