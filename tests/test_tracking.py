@@ -1,14 +1,18 @@
 """Tracking in the virtual laboratory: scatterers moved by a known field, imaged anew, tracked, compared."""
 
 from dataclasses import replace
+from itertools import pairwise
 
+import cv2
 import numpy as np
 import pytest
+from scipy.io import loadmat
 from skimage.registration import optical_flow_ilk
 
+from echospline.beamform import LinearArray, delay_and_sum, demodulate, rigid_motion
 from echospline.block_matching import BlockMatching
 from echospline.carrier_phase import CarrierPhase, taken_back
-from echospline.echo import EchoCine
+from echospline.echo import Echo, EchoCine
 from echospline.errors import InputError
 from echospline.grid import RegularGrid
 from echospline.image import Cine, UltrasoundImage
@@ -16,7 +20,7 @@ from echospline.kelvinlet import NeedleField
 from echospline.needle import NeedlePose
 from echospline.phantom import Phantom
 from echospline.probe import CONVEX, LINEAR
-from echospline.tracking import FlowTracker, Motion, Neighbours, track
+from echospline.tracking import FlowTracker, Motion, Neighbours, regrid, track
 
 SIZES = {"linear": (LINEAR, 0.1), "convex": (CONVEX, 0.17)}
 
@@ -246,3 +250,80 @@ def _two():
 def test_bad_input_is_refused_with_a_reason(make, words):
     with pytest.raises(InputError, match=words):
         make()
+
+
+def test_rotating_disk_is_tracked_to_a_rigid_rotation(recordings):
+    # real channel data (PyMUST's PWI_disk): whatever is not the best rigid motion is error
+    rf = loadmat(recordings / "pymust" / "PWI_disk.mat")["RF"]
+    array = LinearArray(frequency=5.0, sampling=20.0 / 3.0, pitch=0.298, start=9.95, sound_speed=1.48)
+    grid = RegularGrid((251, 501), (0.1, 0.05), (-12.5, 10.0))
+    echoes = [delay_and_sum(demodulate(rf[:, :, k], array), array, grid) for k in range(3)]
+    level = np.sqrt(np.mean(np.abs(echoes[0].iq) ** 2))
+    echoes = [Echo(e.iq / level, grid, e.carrier) for e in echoes]
+    points = RegularGrid((40, 40), (0.5, 0.5), (-11.0, 12.0)).nodes
+    points = points[np.hypot(points[:, 0] + 0.8, points[:, 1] - 22.5) < 8.5]
+    angles, left = [], []
+    for a, b in pairwise(echoes):
+        u = FlowTracker().motion(a, b, points).displacement
+        rigid, angle = rigid_motion(points, u)
+        left.append(u - rigid)
+        angles.append(angle)
+    axial, lateral = rmse(np.concatenate(left))
+    assert axial < 8.0
+    assert lateral < 20.0
+    assert angles == pytest.approx([angles[0]] * 2, rel=0.1)  # it turns evenly
+    assert angles[0] == pytest.approx(0.0064, rel=0.1)
+
+
+def test_rigid_motion_is_recovered():
+    points = np.random.default_rng(0).uniform(0, 10, (50, 2))
+    angle = 0.3
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    u = points @ turn.T + [1.0, -2.0] - points
+    field, found = rigid_motion(points, u)
+    assert found == pytest.approx(angle)
+    assert np.allclose(field, u)
+
+
+def test_beamformer_focuses_a_point_where_it_is():
+    # echoes of one point by its travel times, an independent signal model
+    array = LinearArray(frequency=5.0, sampling=40.0, pitch=0.3, start=5.0, sound_speed=1.54, f_number=1.0)
+    x_e = (np.arange(64) - 31.5) * 0.3
+    t = 5.0 + np.arange(1200) / 40.0
+    x, y = 1.3, 12.0
+    arrival = (y + np.hypot(x - x_e, y)) / 1.54
+    late = t[:, None] - arrival
+    rf = np.exp(-0.5 * (late / 0.13) ** 2) * np.cos(2 * np.pi * 5.0 * late)
+    grid = RegularGrid((81, 161), (0.05, 0.025), (-0.7, 10.0))
+    echo = delay_and_sum(demodulate(rf, array, bandwidth=1.2), array, grid)
+    best = np.unravel_index(echo.envelope().argmax(), echo.iq.shape)
+    assert (grid.x[best[1]], grid.y[best[0]]) == pytest.approx((x, y), abs=0.05)
+    # the baseband's phase is that of the definition, exp(-2 pi i k y), at the point
+    phase = np.angle(echo.iq[best] * np.exp(2j * np.pi * echo.carrier * y))
+    assert abs(phase) < 0.3
+
+
+def test_real_muscle_is_brought_back(recordings):
+    # in-vivo calf (TimTrack): the later frame taken back by the tracked field looks more like the first one
+    files = [recordings / "timtrack" / f"gastroc_jumping_0{k}.png" for k in (86, 90)]
+    frames = [
+        UltrasoundImage.from_array(
+            np.ascontiguousarray(cv2.imread(str(f), cv2.IMREAD_GRAYSCALE)[64:516, 114:686]), (0.0868, 0.0868)
+        )
+        for f in files
+    ]
+    mesh = RegularGrid.covering(frames[0].grid, (143, 113))
+    found = track(frames, mesh.nodes, FlowTracker(), times=np.arange(2.0))
+    trusted = found.confidence[1] > 0.3
+    assert trusted.mean() > 0.5
+    shape = (113, 143)
+    u = regrid(
+        found.displacement[1].reshape(*shape, 2).astype(np.float32), mesh, frames[0].grid
+    ) / np.float32(0.0868)
+    x = np.arange(572, dtype=np.float32)[None, :] + u[..., 0]
+    y = np.arange(452, dtype=np.float32)[:, None] + u[..., 1]
+    back = cv2.remap(frames[1].pixels, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    area = regrid(trusted.reshape(shape).astype(np.float32), mesh, frames[0].grid) > 0.5
+    before, after = (np.corrcoef(frames[0].pixels[area], z[area])[0, 1] for z in (frames[1].pixels, back))
+    assert after > 0.95
+    assert 1.0 - after < 0.6 * (1.0 - before)
