@@ -85,29 +85,42 @@ def _interpolate(coarse: Any, tx: Any, ty: Any, out: Any) -> None:
 def _pattern(
     form: Any, x: float, y: float, first: Any, step: Any, tx: Any, ty: Any, reach: int, out: Any
 ) -> Any:
-    """U less its interpolant around (x, y), into out (height, width); returns the fine index of its first corner.
+    """U less its interpolant around (x, y), into out (1 or 3, height, width): U, or its xx, xy and yy.
 
-    ``first`` and ``step`` are the first coarse point and the coarse spacing, conditioned.
+    ``first`` and ``step`` are the first coarse point and the coarse spacing, conditioned. Returns the fine index (column,
+    row) of the first corner.
     """
-    sx, sy = tx.shape[0], ty.shape[0]
+    sx, sy, parts = tx.shape[0], ty.shape[0], out.shape[0]
     cx, cy = int(np.floor((x - first[0]) / step[0])), int(np.floor((y - first[1]) / step[1]))
     side = 2 * reach + 4
-    U, line = np.empty((side, side)), np.empty(side)
+    U, line = np.empty((3, side, side)), np.empty((3, side))
     for j in range(side):
         for i in range(side):
             dx = first[0] + (cx - reach - 1 + i) * step[0] - x
             dy = first[1] + (cy - reach - 1 + j) * step[1] - y
-            U[j, i] = kernel(form, dx, dy)[0]
-    for v in range(out.shape[0]):
+            U[0, j, i], U[1, j, i], U[2, j, i] = kernel(form, dx, dy)
+    for v in range(out.shape[1]):
         j, t = v // sy, ty[v % sy]
-        for i in range(side):
-            line[i] = t[0] * U[j, i] + t[1] * U[j + 1, i] + t[2] * U[j + 2, i] + t[3] * U[j + 3, i]
+        for e in range(parts):
+            for i in range(side):
+                line[e, i] = (
+                    t[0] * U[e, j, i] + t[1] * U[e, j + 1, i] + t[2] * U[e, j + 2, i] + t[3] * U[e, j + 3, i]
+                )
         dy = first[1] + (cy - reach + v / sy) * step[1] - y
-        for u in range(out.shape[1]):
+        for u in range(out.shape[2]):
             i, w = u // sx, tx[u % sx]
             dx = first[0] + (cx - reach + u / sx) * step[0] - x
-            smooth = w[0] * line[i] + w[1] * line[i + 1] + w[2] * line[i + 2] + w[3] * line[i + 3]
-            out[v, u] = kernel(form, dx, dy)[0] - smooth
+            exact = kernel(form, dx, dy)
+            out[0, v, u] = exact[0] - (
+                w[0] * line[0, i] + w[1] * line[0, i + 1] + w[2] * line[0, i + 2] + w[3] * line[0, i + 3]
+            )
+            if parts == 3:
+                out[1, v, u] = exact[1] - (
+                    w[0] * line[1, i] + w[1] * line[1, i + 1] + w[2] * line[1, i + 2] + w[3] * line[1, i + 3]
+                )
+                out[2, v, u] = exact[2] - (
+                    w[0] * line[2, i] + w[1] * line[2, i + 1] + w[2] * line[2, i + 2] + w[3] * line[2, i + 3]
+                )
     return (cx - 1 - reach) * sx, (cy - 1 - reach) * sy
 
 
@@ -116,7 +129,7 @@ def _patterns(
     form: Any, places: Any, first: Any, step: Any, tx: Any, ty: Any, reach: int, out: Any, corners: Any
 ) -> None:
     """`_pattern` of many places (m, 2)."""
-    room = np.empty((out.shape[1], out.shape[2]))
+    room = np.empty((out.shape[1], out.shape[2], out.shape[3]))
     for m in range(places.shape[0]):
         corners[m, 0], corners[m, 1] = _pattern(
             form, places[m, 0], places[m, 1], first, step, tx, ty, reach, room
@@ -126,15 +139,23 @@ def _patterns(
 
 @njit(**OPTIONS)
 def _add(out: Any, pattern: Any, x0: int, y0: int, wx: float, wy: float) -> None:
-    """out (ny, nx, 2) += (wx, wy) pattern, where the pattern lies inside."""
+    """out (ny, nx, 2) += pattern times (wx, wy), where the pattern lies inside."""
     ny, nx = out.shape[0], out.shape[1]
-    left, right = max(0, -x0), min(pattern.shape[1], nx - x0)
-    for v in range(max(0, -y0), min(pattern.shape[0], ny - y0)):
-        row, line = out[y0 + v].reshape(2 * nx), pattern[v]
-        for u in range(left, right):
-            at = 2 * (x0 + u)
-            row[at] += wx * line[u]
-            row[at + 1] += wy * line[u]
+    left, right = max(0, -x0), min(pattern.shape[2], nx - x0)
+    for v in range(max(0, -y0), min(pattern.shape[1], ny - y0)):
+        row = out[y0 + v].reshape(2 * nx)
+        if pattern.shape[0] == 1:
+            line = pattern[0, v]
+            for u in range(left, right):
+                at = 2 * (x0 + u)
+                row[at] += wx * line[u]
+                row[at + 1] += wy * line[u]
+        else:
+            xx, xy, yy = pattern[0, v], pattern[1, v], pattern[2, v]
+            for u in range(left, right):
+                at = 2 * (x0 + u)
+                row[at] += wx * xx[u] + wy * xy[u]
+                row[at + 1] += wx * xy[u] + wy * yy[u]
 
 
 @njit(**OPTIONS)
@@ -163,9 +184,12 @@ class PixelField:
         self.taps = [taps(s) for s in strides(grid)]
         self.first = scene.conditioned(np.array(self.coarse.origin))
         self.step = np.array(self.coarse.spacing) / scene.scale
-        self.shape = tuple((2 * REACH + 1) * len(t) for t in reversed(self.taps))
-        self.rough = scene.components == 1  # the regularised elastic kernel is smooth on this scale
-        places = np.vstack([scene.anchors, scene.sources])[: None if self.rough else 0]
+        self.shape = (
+            2 * scene.components - 1,
+            (2 * REACH + 1) * len(self.taps[1]),
+            (2 * REACH + 1) * len(self.taps[0]),
+        )
+        places = np.vstack([scene.anchors, scene.sources])
         self.patterns = np.empty((len(places), *self.shape), dtype=np.float32)
         self.corners: NDArray[np.int64] = np.empty((len(places), 2), dtype=np.int64)
         _patterns(scene.form, places, self.first, self.step, *self.taps, REACH, self.patterns, self.corners)
@@ -190,8 +214,10 @@ class PixelField:
         mx, my = self.coarse.shape
         out = np.empty((ny, nx, 2))
         _interpolate(values[: mx * my].reshape(my, mx, 2), *self.taps, out)
-        if self.rough:
+        if len(self.patterns):
             weights = response.spline(slot_of, q, tip, soft, on_tip).weights
+            if self.scene.components == 2:
+                weights = np.ascontiguousarray(weights.reshape(2, -1).T)
             b, k = len(self.scene.anchors), response.count
             which = np.concatenate([np.arange(b), b + response.slots[:k]])
             _add_all(out, self.patterns, self.corners, which, weights[: b + k])
@@ -199,5 +225,5 @@ class PixelField:
                 room = np.empty(self.shape)
                 x, y = (tip[1:3] - self.scene.centre) / self.scene.scale
                 x0, y0 = _pattern(self.scene.form, x, y, self.first, self.step, *self.taps, REACH, room)
-                _add(out, room, x0, y0, weights[-1, 0], weights[-1, 1])
+                _add(out, room, x0, y0, float(weights[-1, 0]), float(weights[-1, 1]))
         return out.reshape(-1, 2)
