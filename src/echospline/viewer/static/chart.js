@@ -44,11 +44,8 @@ export function drawChart(canvas, plot) {
     c.fillText(short(y), box.left - 6, py(y));
   }
   c.textAlign = "center";
-  const steps = plot.counted ? Math.min(x1 - x0, 8) : 4;
-  for (let k = 0; k <= steps; ++k) {
-    const x = x0 + ((x1 - x0) * k) / steps;
-    c.fillText(short(plot.counted ? Math.round(x) : x), px(x), box.bottom + 12);
-  }
+  const step = plot.counted ? Math.max(1, Math.ceil((x1 - x0) / 8)) : niceStep((x1 - x0) / 5);
+  for (let x = x0; x <= x1 + 1e-9; x += step) c.fillText(short(x), px(x), box.bottom + 12);
   c.fillText(plot.xLabel, (box.left + box.right) / 2, height - 8);
   c.textAlign = "left";
   c.fillText(plot.yLabel, 4, 9);
@@ -89,6 +86,12 @@ export function drawChart(canvas, plot) {
 function niceAbove(value) {
   const power = 10 ** Math.floor(Math.log10(value));
   return power * ([1, 1.2, 1.6, 2, 2.4, 3.2, 4, 4.8, 6, 8, 10].find((step) => step * power >= value) ?? 10);
+}
+
+/** A round distance between ticks, at least as large. @param {number} value */
+function niceStep(value) {
+  const power = 10 ** Math.floor(Math.log10(value));
+  return power * ([1, 2, 2.5, 5, 10].find((step) => step * power >= value) ?? 10);
 }
 
 /** @param {number} value */
