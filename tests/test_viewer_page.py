@@ -135,7 +135,7 @@ def place(page, x, y):
     return left + scale * x, top + scale * y, scale
 
 
-def drag(page, start, end, steps=12):
+def drag(page, start, end, steps=6):
     box = page.locator("#stage").bounding_box()
     (ax, ay, _), (bx, by, _) = place(page, *start), place(page, *end)
     page.mouse.move(box["x"] + ax, box["y"] + ay)
