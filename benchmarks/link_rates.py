@@ -34,7 +34,8 @@ from echospline.openigtlink.peer import Peer
 from echospline.openigtlink.picture import Looks, draw
 from echospline.openigtlink.pose import Transform
 from echospline.openigtlink.scene import Visible
-from echospline.openigtlink.session import Rates, Session, SessionOptions
+from echospline.openigtlink.session import Session
+from echospline.openigtlink.stage import Rates, SessionOptions
 from echospline.scenario import Scenario
 
 SIDE, WARM_UP = 512, 0.5

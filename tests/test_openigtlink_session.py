@@ -30,7 +30,8 @@ from echospline.openigtlink.picture import Looks
 from echospline.openigtlink.plus import read_calibration
 from echospline.openigtlink.pose import Position, Transform
 from echospline.openigtlink.scene import AXIAL, ImagingPlane, Reach
-from echospline.openigtlink.session import Rates, Session, SessionOptions, Stage
+from echospline.openigtlink.session import Session
+from echospline.openigtlink.stage import Rates, SessionOptions, Stage
 from echospline.openigtlink.text import Command, CommandReply, Status, String
 from echospline.openigtlink.tracking import Naming, Tracking
 from echospline.warp import warp
@@ -215,18 +216,18 @@ def test_a_needle_that_leaves_the_plane_fades_and_lets_go_of_the_tissue() -> Non
     with Session(Stage(dark, bright.engine), options) as session:
         peer = Console(session.port)
 
-        def brightest(z: float, words: str) -> int:
+        def brightest(z: float, *words: str) -> int:
             tip = PLANE.tip_matrix(pose_at(12.0))
             tip[2, 3] += z  # the axial plane's z is the patient's S
             peer.send(Message(Transform(tip), "NeedleTipToReference"))
-            peer.wait(lambda m: isinstance(m.content, Status) and words in m.content.text)
+            peer.wait(lambda m: isinstance(m.content, Status) and all(w in m.content.text for w in words))
             image = peer.wait(lambda m: isinstance(m.content, Image)).content
             assert isinstance(image, Image)
             return int(image.voxels.max())
 
-        full = brightest(0.0, "+0.0 mm out of plane, tilt 0 deg, echo 100 %")
-        half = brightest(1.9, "+1.9 mm out of plane, tilt 0 deg, echo 53 %")
-        faint = brightest(-3.8, "-3.8 mm out of plane, tilt 0 deg, echo 0 %")
+        full = brightest(0.0, "depth 12.0 mm", "0.0 mm out of plane, tilt 0 deg, echo 100 %")
+        half = brightest(1.9, "depth 12.0 mm", "+1.9 mm out of plane, tilt 0 deg, echo 53 %")
+        faint = brightest(-3.8, "depth 12.0 mm", "-3.8 mm out of plane, tilt 0 deg, echo 0 %")
         assert full > 180
         assert 99 < half < full - 30
         assert faint == 99
@@ -327,9 +328,8 @@ def test_targets_move_with_the_tissue() -> None:
         peer = Console(session.port)
         peer.tip(pose_at(0.5))
         peer.tip(pose_at(12.0))
-        expected = PLANE.lift(
-            np.array([[14.0, 10.0]]) + Dragged().displacement_at(pose_at(12.0), [[14.0, 10.0]])
-        )[0]
+        moved = Deformation(MESH, Dragged().displacement(pose_at(12.0))).forward(np.array([[14.0, 10.0]]))
+        expected = PLANE.lift(moved)[0]
         message = peer.wait(
             lambda m: (
                 isinstance(m.content, Points)

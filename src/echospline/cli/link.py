@@ -23,7 +23,8 @@ from echospline.openigtlink.link import PORT
 from echospline.openigtlink.picture import Looks
 from echospline.openigtlink.plus import read_calibration
 from echospline.openigtlink.scene import Reach
-from echospline.openigtlink.session import Rates, Session, SessionOptions, Stage
+from echospline.openigtlink.session import Session
+from echospline.openigtlink.stage import Rates, SessionOptions, Stage
 from echospline.openigtlink.tracking import Naming
 from echospline.scenario import Scenario, load
 

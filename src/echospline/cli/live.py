@@ -23,7 +23,8 @@ from echospline.needle_echo import NeedleEcho
 from echospline.openigtlink.link import PORT
 from echospline.openigtlink.picture import Looks
 from echospline.openigtlink.plus import read_calibration
-from echospline.openigtlink.session import Rates, Session, SessionOptions
+from echospline.openigtlink.session import Session
+from echospline.openigtlink.stage import Rates, SessionOptions
 from echospline.openigtlink.tracking import Naming
 from echospline.scenario import Scenario
 from echospline.viewer.exercise import default_exercises

@@ -7,21 +7,19 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from math import isfinite
+from dataclasses import replace
 from types import TracebackType
 from typing import Self
 
 from echospline.errors import EchosplineError, InputError
-from echospline.image import Pixels, UltrasoundImage
+from echospline.image import Pixels
 from echospline.live import LiveEngine, Metronome, Pacer, Snapshot
-from echospline.needle import Insertion, NeedlePose
-from echospline.openigtlink.link import PORT, Link, LinkLimits
+from echospline.needle import NeedlePose
+from echospline.openigtlink.link import Link
 from echospline.openigtlink.message import Message
 from echospline.openigtlink.orders import Order, answer, order_of
 from echospline.openigtlink.peer import Peer
 from echospline.openigtlink.picture import (
-    Looks,
     draw,
     image_message,
     mesh_message,
@@ -29,7 +27,8 @@ from echospline.openigtlink.picture import (
     target_message,
 )
 from echospline.openigtlink.pose import Position, Transform
-from echospline.openigtlink.scene import Reach, TrackedNeedle, Visible
+from echospline.openigtlink.scene import TrackedNeedle, Visible
+from echospline.openigtlink.stage import SessionOptions, Stage
 from echospline.openigtlink.text import NOT_READY, UNKNOWN_ERROR, Status
 from echospline.openigtlink.tracking import Located, Tracking
 
@@ -37,85 +36,6 @@ log = logging.getLogger("echospline.openigtlink")
 
 ARRIVES = 1.0
 """mm; a needle first seen deeper than this is put there rather than thrust there."""
-
-
-@dataclass(frozen=True)
-class Stage:
-    """What is simulated.
-
-    Parameters
-    ----------
-    image : UltrasoundImage
-        At rest.
-    engine : LiveEngine
-        Tissue and needle.
-    models : tuple of str
-        Names that the engine can be switched to.
-    insertion : Insertion, optional
-        The path that `start` plays.
-    """
-
-    image: UltrasoundImage
-    engine: LiveEngine
-    models: tuple[str, ...] = ()
-    insertion: Insertion | None = None
-
-
-@dataclass(frozen=True)
-class Rates:
-    """How often what is sent.
-
-    Parameters
-    ----------
-    image : float
-        Pictures per second, with the needle's transform; above 0, at most 1000.
-    mesh : float
-        Displaced meshes per second; 0 for none.
-    status : float
-        STATUS per second; 0 for none.
-    """
-
-    image: float = 30.0
-    mesh: float = 5.0
-    status: float = 2.0
-
-    def __post_init__(self) -> None:
-        if not (isfinite(self.image) and 0 < self.image <= 1000):
-            raise InputError(f"the image rate is above 0 and at most 1000 per second; got {self.image}")
-        for name in ("mesh", "status"):
-            if not (isfinite(getattr(self, name)) and getattr(self, name) >= 0):
-                raise InputError(f"the {name} rate is 0 or more per second; got {getattr(self, name)}")
-
-
-@dataclass(frozen=True)
-class SessionOptions:
-    """How a session behaves.
-
-    Parameters
-    ----------
-    host : str
-        Address to listen on; empty for none.
-    port : int
-        Port to listen on; 0 for any free one.
-    connect : tuple of (host, port)
-        Servers to connect to.
-    looks : Looks
-        Names of frames, the needle's looks.
-    reach : Reach
-        What counts as near the plane.
-    rates : Rates
-        How often what is sent.
-    limits : LinkLimits
-        What the link takes upon itself.
-    """
-
-    host: str = "127.0.0.1"
-    port: int = PORT
-    connect: tuple[tuple[str, int], ...] = ()
-    looks: Looks = field(default_factory=Looks)
-    reach: Reach = field(default_factory=Reach)
-    rates: Rates = field(default_factory=Rates)
-    limits: LinkLimits = field(default_factory=LinkLimits)
 
 
 class Session:

@@ -1,0 +1,93 @@
+"""What a session simulates, how often it tells, and on what terms it meets its peers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import isfinite
+
+from echospline.errors import InputError
+from echospline.image import UltrasoundImage
+from echospline.live import LiveEngine
+from echospline.needle import Insertion
+from echospline.openigtlink.link import PORT, LinkLimits
+from echospline.openigtlink.picture import Looks
+from echospline.openigtlink.scene import Reach
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What is simulated.
+
+    Parameters
+    ----------
+    image : UltrasoundImage
+        At rest.
+    engine : LiveEngine
+        Tissue and needle.
+    models : tuple of str
+        Names that the engine can be switched to.
+    insertion : Insertion, optional
+        The path that `start` plays.
+    """
+
+    image: UltrasoundImage
+    engine: LiveEngine
+    models: tuple[str, ...] = ()
+    insertion: Insertion | None = None
+
+
+@dataclass(frozen=True)
+class Rates:
+    """How often what is sent.
+
+    Parameters
+    ----------
+    image : float
+        Pictures per second, with the needle's transform; above 0, at most 1000.
+    mesh : float
+        Displaced meshes per second; 0 for none.
+    status : float
+        STATUS per second; 0 for none.
+    """
+
+    image: float = 30.0
+    mesh: float = 5.0
+    status: float = 2.0
+
+    def __post_init__(self) -> None:
+        if not (isfinite(self.image) and 0 < self.image <= 1000):
+            raise InputError(f"the image rate is above 0 and at most 1000 per second; got {self.image}")
+        for name in ("mesh", "status"):
+            if not (isfinite(getattr(self, name)) and getattr(self, name) >= 0):
+                raise InputError(f"the {name} rate is 0 or more per second; got {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class SessionOptions:
+    """How a session behaves.
+
+    Parameters
+    ----------
+    host : str
+        Address to listen on; empty for none.
+    port : int
+        Port to listen on; 0 for any free one.
+    connect : tuple of (host, port)
+        Servers to connect to.
+    looks : Looks
+        Names of frames, the needle's looks.
+    reach : Reach
+        What counts as near the plane.
+    rates : Rates
+        How often what is sent.
+    limits : LinkLimits
+        What the link takes upon itself.
+    """
+
+    host: str = "127.0.0.1"
+    port: int = PORT
+    connect: tuple[tuple[str, int], ...] = ()
+    looks: Looks = field(default_factory=Looks)
+    reach: Reach = field(default_factory=Reach)
+    rates: Rates = field(default_factory=Rates)
+    limits: LinkLimits = field(default_factory=LinkLimits)
