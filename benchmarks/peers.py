@@ -35,8 +35,7 @@ def opencv(x, y, d):
     cv2.setNumThreads(1)
     spline = cv2.createThinPlateSplineShapeTransformer()
     matches = [cv2.DMatch(i, i, 0) for i in range(len(y))]
-    # its transformation maps target points back: source and target change places
-    spline.estimateTransformation((y + d).astype(np.float32)[None], y.astype(np.float32)[None], matches)
+    spline.estimateTransformation(y.astype(np.float32)[None], (y + d).astype(np.float32)[None], matches)
     return spline.applyTransformation(x.astype(np.float32)[None])[1][0] - x
 
 
@@ -63,14 +62,12 @@ def vtk_spline(x, y, d):
 def itk_spline(x, y, d):
     import itk
 
-    kind = itk.ThinPlateR2LogRSplineKernelTransform[itk.D, 2]
-    spline, sets = kind.New(), []
+    spline = itk.ThinPlateR2LogRSplineKernelTransform[itk.D, 2].New()
+    kind, sets = type(spline.GetModifiableSourceLandmarks()), []
     for p in (y, y + d):
-        points = itk.PointSet[
-            itk.Vector[itk.D, 2], 2, itk.DefaultStaticMeshTraits[itk.D, 2, 2, itk.D, itk.D, itk.D]
-        ].New()
+        points = kind.New()
         for i, (a, b) in enumerate(p):
-            points.SetPoint(i, [float(a), float(b)])
+            points.SetPoint(i, itk.Point[itk.D, 2]([float(a), float(b)]))
         sets.append(points)
     spline.SetSourceLandmarks(sets[0])
     spline.SetTargetLandmarks(sets[1])

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from echospline.grid import Floats, RegularGrid
 from echospline.mechanics.anchored_kernel import AnchoredKernel
-from echospline.mechanics.compiled import OPTIONS, kernel
+from echospline.mechanics.compiled import OPTIONS, compile_ahead, kernel
 from echospline.mechanics.response import Response
 
 FINE = 20_000
@@ -180,6 +180,7 @@ class PixelField:
     """
 
     def __init__(self, grid: RegularGrid, scene: AnchoredKernel) -> None:
+        compile_ahead("a node per pixel", _try_out)
         self.grid, self.scene, self.coarse = grid, scene, coarse_grid(grid)
         self.taps = [taps(s) for s in strides(grid)]
         self.first = scene.conditioned(np.array(self.coarse.origin))
@@ -227,3 +228,16 @@ class PixelField:
                 x0, y0 = _pattern(self.scene.form, x, y, self.first, self.step, *self.taps, REACH, room)
                 _add(out, room, x0, y0, float(weights[-1, 0]), float(weights[-1, 1]))
         return out.reshape(-1, 2)
+
+
+def _try_out() -> None:
+    """Call every loop once with the types that a step uses."""
+    out, tap, corners = np.zeros((3, 3, 2)), taps(2), np.zeros((1, 2), dtype=np.int64)
+    form, first, step = np.array([1.0, 0.0, 0.0]), np.zeros(2), np.ones(2)
+    _interpolate(np.zeros((6, 6, 2)), tap, tap, out)
+    patterns = np.zeros((1, 1, 6, 6), dtype=np.float32)
+    _patterns(form, np.zeros((1, 2)), first, step, tap, tap, 1, patterns, corners)
+    _add_all(out, patterns, corners, np.zeros(1, dtype=np.int64), np.zeros((1, 2)))
+    room = np.zeros((1, 6, 6))
+    x0, y0 = _pattern(form, 0.0, 0.0, first, step, tap, tap, 1, room)
+    _add(out, room, x0, y0, 0.0, 0.0)
