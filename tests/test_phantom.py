@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from scipy import signal, stats
 
+from echospline.acoustic import channel_data
+from echospline.beamform import LinearArray
 from echospline.echo import Display, Echo
-from echospline.errors import InputError
+from echospline.errors import InputError, MissingExtraError
 from echospline.grid import RegularGrid
 from echospline.phantom import Inclusion, Layer, Phantom, Scatterers, deposit
 from echospline.probe import CONVEX, LINEAR, Probe
@@ -211,3 +213,12 @@ def test_compounding_brings_the_envelope_closer_to_its_mean():
 def test_bad_input_is_refused_with_a_reason(make, words):
     with pytest.raises(InputError, match=words):
         make()
+
+
+def test_missing_simulator_names_the_command(monkeypatch):
+    def absent(name):
+        raise ImportError(name)
+
+    monkeypatch.setattr("echospline.acoustic.import_module", absent)
+    with pytest.raises(MissingExtraError, match="echospline\\[acoustic\\]"):
+        channel_data(np.zeros((1, 2)), np.ones(1), LinearArray(5.0, 20.0, 0.3))
