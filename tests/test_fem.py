@@ -67,11 +67,13 @@ def test_friction_relaxes_exponentially_once_the_needle_stops():
     np.testing.assert_allclose(model.displacement(twice), model.displacement(once), rtol=1e-9, atol=1e-15)
 
 
-def test_tip_force_stays_while_the_needle_rests():
-    model = FEMModel(GRID, forces=NeedleForces(friction=0.0))
+@pytest.mark.parametrize("ramp", [0.0, 1.0])
+def test_tip_force_stays_while_the_needle_rests(ramp):
+    model = FEMModel(GRID, forces=NeedleForces(friction=0.0, ramp=ramp))
     insertion = Insertion.straight((8, 0), 45, 18, 5, dwell=2.0)
     arrived = run(model, Insertion.straight((8, 0), 45, 18, 5), 0.02)
     rested = run(model, insertion, 0.02)
+    assert np.abs(arrived.displacement).max() > 0.1
     np.testing.assert_allclose(rested.displacement, arrived.displacement, atol=1e-9)
 
 

@@ -125,6 +125,20 @@ def test_field_at_nodes_is_the_field_at_points():
     np.testing.assert_allclose(model.displacement_at(state, GRID.nodes), state.displacement, atol=1e-12)
 
 
+@pytest.mark.parametrize("depth", [0.3, 7.0, 12.6])
+def test_stations_carry_the_whole_shaft_and_its_moment(depth):
+    """Lengths add up to the depth; whole stations have their centre in the middle of what they stand for."""
+    model = GreenModel(GRID, BOX)
+    pose = Insertion.straight((12, 0), 60, depth).pose(depth / 5)
+    points, covered = model.stations(pose)
+    assert covered.sum() == pytest.approx(depth)
+    whole = covered == model.station_spacing
+    centre = np.average(points[whole], axis=0, weights=covered[whole]) if whole.any() else None
+    if centre is not None:
+        expected = np.array([12.0, 0.0]) + np.floor(depth + 1e-9) / 2 * np.array(pose.axis)
+        np.testing.assert_allclose(centre, expected, atol=1e-9)
+
+
 def test_stations_kept_between_steps_change_nothing():
     model = GreenModel(GRID, BOX, forces=NeedleForces(0.4, 1e-3, ramp=0.0))
     insertion = Insertion.straight((12, 0), 60, 26)
