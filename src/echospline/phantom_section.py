@@ -25,10 +25,10 @@ class ProbeSection(Section):
     f_number: float = Field(2.0, ge=0.5, le=20, description="depth over aperture: sets the beam's width")
     sampling: float = Field(40.0, gt=0.5, le=1000, description="rate of RF samples, MHz; snr is per sample")
     snr: float = Field(
-        20.0, ge=-20, le=200, description="0 dB speckle over electronic noise at mid-depth, dB"
+        40.0, ge=-20, le=200, description="0 dB speckle over electronic noise at mid-depth, dB"
     )
     attenuation: float = Field(
-        0.5, ge=0, le=10, description="one way, dB/(cm MHz), undone by the gain: noise grows with depth"
+        0.0, ge=0, le=10, description="one way, dB/(cm MHz), undone by the gain: noise grows with depth"
     )
     focus: Annotated[Millimetres, Field(gt=0)] | None = Field(
         None, description="depth of a fixed focus, mm; focused everywhere where not given"
