@@ -366,6 +366,27 @@ def test_an_image_of_ones_own_can_be_opened(live, tmp_path):
     hold(live, "ArrowDown", "Number(d.depth) > 1")
 
 
+def test_a_scene_that_loads_slowly_is_not_drawn_or_reported_before_it_is_whole(live, context):
+    """The second scene's image is held back while its frames come in and a gamepad pushes all the time; the server
+    would close a page whose report of drawn frames goes back to none."""
+
+    def late(route):
+        time.sleep(0.5)
+        route.continue_()
+
+    context.route("**/api/image*", late)
+    live.evaluate(
+        "() => { navigator.getGamepads = () => [{ connected: true, axes: [0, 0.3, 0, 0], buttons: [] }]; }"
+    )
+    live.locator("#open").click()
+    live.locator("#upload-file").set_input_files({"name": "a.png", "mimeType": "image/png", "buffer": b"x"})
+    live.locator("#upload-spacing").fill("0.1")
+    live.locator("#upload-form button[type=submit]").click()
+    expect(live.locator("#title")).to_have_text("Uploaded")
+    wait_until(live, "Number(d.depth) > 1 && Number(text('depth')) > 0.5")
+    assert live.get_attribute("#connection", "data-state") == "open"
+
+
 def test_with_a_token_the_page_works_and_without_it_says_why_not(context, tmp_path):
     with running(tmp_path, settings=Settings(port=0, token="a-secret")) as (address, _, _):
         page = context.new_page()

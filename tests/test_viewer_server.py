@@ -546,6 +546,29 @@ def test_a_large_upload_is_refused_before_it_is_kept(uploading, monkeypatch):
     assert status == 413
 
 
+def test_uploads_are_read_one_at_a_time(tmp_path):
+    entered, go = threading.Event(), threading.Event()
+
+    def slow(path, spacing):
+        entered.set()
+        assert go.wait(20)
+        return scene()
+
+    with running(tmp_path, opener=slow) as (address, _, _):
+        answers = []
+        first = threading.Thread(
+            target=lambda: answers.append(
+                get(address, "/api/upload?name=a.png&spacing=1", "POST", b"good")[0]
+            )
+        )
+        first.start()
+        assert entered.wait(20)
+        assert get(address, "/api/upload?name=b.png&spacing=1", "POST", b"good")[0] == 429
+        go.set()
+        first.join(20)
+        assert answers == [200]
+
+
 def test_uploads_are_off_without_an_opener(address):
     assert get(address, "/api/upload?name=a.png&spacing=1", "POST", b"good")[0] == 403
 

@@ -93,6 +93,7 @@ class Room:
     settings: Settings
     opener: SceneOpener | None = None
     clients: int = 0
+    uploading: asyncio.Lock = field(default_factory=asyncio.Lock)
     parked: OrderedDict[str, tuple[float, Seat]] = field(default_factory=OrderedDict)
     taken: list[Seat] = field(default_factory=list)
 
@@ -300,8 +301,17 @@ async def _upload(request: Request) -> Response:
     if suffix is None:
         return PlainTextResponse("the file's name needs an ending such as .png or .mha", 422)
     spacing = _spacing(request.query_params.get("spacing", ""))
+    if room.uploading.locked():  # one at a time: a picture takes memory while it is read
+        return PlainTextResponse("another file is being read: try again in a moment", 429)
+    async with room.uploading:
+        return await _open_upload(request, room, room.opener, suffix.group().lower(), spacing)
+
+
+async def _open_upload(
+    request: Request, room: Room, opener: SceneOpener, suffix: str, spacing: tuple[float, float] | None
+) -> Response:
     with tempfile.TemporaryDirectory(prefix="echospline-") as folder:
-        path = Path(folder) / f"upload{suffix.group().lower()}"
+        path = Path(folder) / f"upload{suffix}"
         size = 0
         with path.open("wb") as file:
             async for chunk in request.stream():
@@ -309,7 +319,7 @@ async def _upload(request: Request) -> Response:
                 if size > UPLOAD_BYTES:
                     return PlainTextResponse(f"an upload has at most {UPLOAD_BYTES // 2**20} MiB", 413)
                 file.write(chunk)
-        scene = await asyncio.to_thread(room.opener, path, spacing)
+        scene = await asyncio.to_thread(opener, path, spacing)
     name = secrets.token_hex(8)
     room.scenes[name] = scene
     while len(room.scenes) > 1 + UPLOADED_SCENES:

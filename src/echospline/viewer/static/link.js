@@ -41,6 +41,8 @@ export class Link {
     this.newest = null;
     this.received = 0;
     this.commands = 0;
+    this.drawn = 0; // number of the newest frame drawn on this connection
+    this.entered = false; // whether its scene is shown: before that nothing is reported
     this.openedAt = 0;
     this.wait = 250;
     /** @type {WebSocket | null} */
@@ -54,7 +56,8 @@ export class Link {
     address.search = new URLSearchParams({ seat: seat(), scene: this.scene }).toString();
     const socket = new WebSocket(address, this.token ? [SUBPROTOCOL, `token.${this.token}`] : [SUBPROTOCOL]);
     this.socket = socket;
-    this.commands = 0;
+    this.commands = this.drawn = 0;
+    this.entered = false;
     this.openedAt = performance.now();
     this.newest = null;
     socket.binaryType = "arraybuffer";
@@ -100,13 +103,12 @@ export class Link {
 
   /**
    * Report what was drawn, and where the needle shall go.
-   * @param {number} drawn
    * @param {Pose | null} pose
    */
-  command(drawn, pose) {
-    if (this.socket?.readyState !== WebSocket.OPEN) return;
+  command(pose) {
+    if (this.socket?.readyState !== WebSocket.OPEN || !this.entered) return;
     this.commands += 1;
-    this.socket.send(encodeCommand(drawn, this.commands, performance.now(), pose));
+    this.socket.send(encodeCommand(this.drawn, this.commands, performance.now(), pose));
   }
 
   /** @param {object} request */

@@ -23,7 +23,6 @@ const shown = { guide: true, arrows: false };
 let scene = null;
 /** @type {Frame | null} */
 let frame = null;
-let drawn = 0;
 let dirty = true;
 let model = "";
 let period = 1 / 120; // s between steps of the model
@@ -69,12 +68,13 @@ async function told(message) {
 
 /** @param {any} message */
 async function enter(message) {
+  scene = frame = null; // nothing is drawn before the scene is whole
+  const connection = link.socket;
   const pixels = new Uint8Array(await (await link.fetch(`/api/image?scene=${encodeURIComponent(link.scene)}`)).arrayBuffer());
+  if (link.socket !== connection) return; // another connection came meanwhile, with a scene of its own
   scene = message.scene;
   model = message.model;
   period = message.period;
-  drawn = 0;
-  frame = null;
   const { mesh } = scene;
   const [x0, y0] = mesh.origin;
   view.extent = needle.extent = { x0, y0, x1: x0 + (mesh.shape[0] - 1) * mesh.spacing[0], y1: y0 + (mesh.shape[1] - 1) * mesh.spacing[1] };
@@ -93,6 +93,7 @@ async function enter(message) {
   controls.enabled = true;
   fault("");
   resize();
+  link.entered = true;
   stage.dataset.ready = "true";
 }
 
@@ -365,6 +366,14 @@ function slowReadouts() {
 }
 setInterval(slowReadouts, 500);
 
+// A tab that was hidden holds a frame from then: it is passed over, and the present asked for.
+document.addEventListener("visibilitychange", () => {
+  const old = document.visibilityState === "visible" ? link.take() : null;
+  if (!old) return;
+  link.drawn = old.number;
+  link.command(null);
+});
+
 let lastCommand = 0;
 /** @param {number} now ms */
 function loop(now) {
@@ -389,9 +398,9 @@ function loop(now) {
     dirty = false;
     drawTimes.push(now);
   }
-  if (next) drawn = next.number;
+  if (next) link.drawn = next.number;
   if (next || needle.changed) {
-    link.command(drawn, needle.changed ? needle.pose : null);
+    link.command(needle.changed ? needle.pose : null);
     needle.changed = false;
   }
 }
