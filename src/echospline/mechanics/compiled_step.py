@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 
 from echospline.mechanics.compiled import CHUNK, OPTIONS, add_range, kernel, kernel_rows
-from echospline.mechanics.contacts import inverse
+from echospline.mechanics.contacts import green, inverse
 from echospline.mechanics.interaction import CALM, LET_GO
 from echospline.needle import ZERO_LENGTH
 
@@ -469,6 +469,49 @@ def move(
                 gx, gy = table[j, 2] - fx, table[j, 3] - fy
                 q[j, 0], q[j, 1] = _follow(fx + gx * kept, fy + gy * kept, fx, fy, travel)
     return q, tip, free, on_tip, soft, quantities
+
+
+@njit(**OPTIONS)
+def begin_patch(
+    form: Any, nodes: Any, centre: Any, reach: float, anchors: Any, L_inverse: Any, sources: Any, felt: Any, slots: Any,
+    k: int, P: Any, points: Any, toq: Any
+) -> Any:  # fmt: skip
+    """What a patch with interpolation points ``nodes`` (Q, 2) needs; fills ``toq`` (G of contacts and nodes).
+
+    Without BLAS: its threads wait for each other, and beside a busy process that takes longer than many steps.
+
+    Returns
+    -------
+    held : (Q c, m)
+        L_B^-1 [U_qB P_q] of the nodes.
+    near : (j,)
+        Points within ``reach`` of the centre.
+    rough : (j, Q) or (j, 3 Q)
+        U of those and the nodes; xx, xy and yy with two components.
+    """
+    c, Q, n = int(form[0]), nodes.shape[0], points.shape[1]
+    held = np.empty((Q * c, L_inverse.shape[0]))
+    for a in range(Q):
+        quantities = at_point(form, nodes[a, 0], nodes[a, 1], anchors, L_inverse, sources, felt, slots, 0, P)
+        for e in range(c):
+            held[a * c + e] = quantities[1][e]
+    for j in range(k):
+        for a in range(Q):
+            green(form, sources, felt, slots[j], nodes, held, a, toq, j * c, a * c)
+    near, count = np.empty(n, dtype=np.int64), 0
+    for i in range(n):
+        dx, dy = points[0, i] - centre[0], points[1, i] - centre[1]
+        if dx * dx + dy * dy <= reach * reach:
+            near[count] = i
+            count += 1
+    rough = np.empty((count, Q * (2 * c - 1)))
+    for i in range(count):
+        for a in range(Q):
+            xx, xy, yy = kernel(form, points[0, near[i]] - nodes[a, 0], points[1, near[i]] - nodes[a, 1])
+            rough[i, a] = xx
+            if c == 2:
+                rough[i, Q + a], rough[i, 2 * Q + a] = xy, yy
+    return held, near[:count].copy(), rough
 
 
 @njit(**OPTIONS)

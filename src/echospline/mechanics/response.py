@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from echospline.errors import SolverError
 from echospline.grid import Floats
-from echospline.mechanics.anchored_kernel import AnchoredKernel, interleaved
-from echospline.mechanics.compiled_step import at_point, spread
+from echospline.mechanics.anchored_kernel import AnchoredKernel
+from echospline.mechanics.compiled_step import at_point, begin_patch, spread
 from echospline.mechanics.contacts import build_rows, drop, join, misfit
 from echospline.mechanics.spline import Spline
 from echospline.mechanics.tip_patch import COEFFICIENTS, DEGREE, NODES, TipPatch
@@ -246,17 +246,12 @@ class Response:
             self.square = np.array([*self.patch.centre, self.patch.half])
 
     def _begin(self, patch: TipPatch) -> None:
-        s, c, k = self.scene, self.scene.components, self.count
+        s = self.scene
         self.patch, self.patch_nodes = patch, patch.nodes
-        self.patch_held = np.ascontiguousarray(s.coupling(patch.nodes).T)
-        where = self.slots[:k]
-        index = (where[:, None] * c + np.arange(c)).ravel()
-        direct = interleaved(interleaved(s.kernel.matrix(s.sources[where], patch.nodes), c).T, c).T
-        self.toq[: k * c] = direct - s.felt[index] @ self.patch_held.T
-        self.near = np.flatnonzero(np.hypot(*(s.points - patch.centre).T) <= patch.near)
-        U = s.kernel.matrix(s.points[self.near], patch.nodes)
-        m, Q = len(self.near), len(patch.nodes)
-        self.rough = np.ascontiguousarray(U if c == 1 else np.hstack([U[:m, :Q], U[:m, Q:], U[m:, Q:]]))
+        self.patch_held, self.near, self.rough = begin_patch(
+            s.form, patch.nodes, np.array(patch.centre), patch.near, s.anchors, s.L_inverse, s.sources, s.felt, self.slots,
+            self.count, self.inverse, s.columns, self.toq,
+        )  # fmt: skip
         self.statistics.patches += 1
 
     # --- the field
