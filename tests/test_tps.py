@@ -94,6 +94,18 @@ def test_halving_dt_changes_nothing_in_relaxation():
     np.testing.assert_allclose(relax(relax(q, target, 1.7, 0.2), target, 1.7, 0.2), once, rtol=1e-14)
 
 
+def test_at_rest_the_field_keeps_its_shape_and_fades():
+    path = Insertion.straight((8, 0), 40, 25, 8.0, dwell=3.0)
+    for model in (TPSModel(GRID), TPSModel(GRID, solver="refit")):
+        state = model.advance(drive(model, path, 1 / 40, duration=3.125), path.pose(3.2), 0.0)
+        before, after = model.displacement(state), []
+        for _ in range(4):
+            state = model.advance(state, path.pose(3.3), 0.5)
+            after.append(model.displacement(state))
+        for k, u in enumerate(after):
+            np.testing.assert_allclose(u, before * np.exp(-0.5 * (k + 1)), atol=1e-6)
+
+
 @pytest.mark.parametrize("loading", ["follow", "immediate"])
 def test_rest_after_a_push_does_not_depend_on_the_frame_rate(loading):
     parameters = TPSParameters(loading=loading)
@@ -186,8 +198,9 @@ def test_a_straight_push_is_held_back_at_most_while_it_enters():
     path = Insertion.straight((12, 0), 55, 20, 5.0)
     entered, state = None, model.rest()
     for i in range(240):
-        state = model.advance(state, path.pose((i + 1) / 60), 1 / 60)
-        if entered is None and state.pose.depth > 1.0:
+        pose = path.pose((i + 1) / 60)
+        state = model.advance(state, pose, 1 / 60)
+        if entered is None and pose.depth > 1.0:
             entered = state.held_back
     assert entered <= 4
     assert state.held_back == entered

@@ -441,7 +441,9 @@ def move(
             wx, wy = _value(h, table[:, 2:4], slot_of)
         inline = fx * ax + fy * ay
         ahead = push
-        if speed <= 0.0:
+        if speed <= 0.0:  # (17): at rest the whole field relaxes, the tip's push with the contacts
+            lost = (wx * ax + wy * ay) * (1.0 - kept)
+            wx, wy = wx - lost * ax, wy - lost * ay
             ahead = min(wx * ax + wy * ay, push)
         tip[0], tip[1], tip[2], tip[5] = 1.0, x, y, 1.0
         tip[3], tip[4] = _follow(wx, wy, ahead * ax + fx - inline * ax, ahead * ay + fy - inline * ay, travel)

@@ -465,7 +465,10 @@ class TPSModel:
         free = np.zeros(2) if field is None else field(point)[0]
         # a tip that begins to push starts from the displacement that the tissue had there before the step
         was = self.displacement_at(old, point[None])[0] if old.tip is None else old.tip.q
-        ahead = float(push @ axis) if pose.speed > 0 else min(float(was @ axis), float(push @ axis))
+        ahead = float(push @ axis)
+        if pose.speed == 0:  # (17): at rest the whole field relaxes, the tip's push with the contacts
+            was = _across(was, axis) + relax(was, np.zeros(2), self.parameters.alpha3, dt) @ axis * axis
+            ahead = min(float(was @ axis), ahead)
         wanted = ahead * axis + _across(free, axis)
         return Tip(point, follow(was[None], wanted[None], travel)[0])
 
