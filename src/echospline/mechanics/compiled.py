@@ -11,6 +11,8 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from llvmlite import ir
@@ -196,6 +198,22 @@ def update_rows(
 
 _ready: set[str] = set()
 _lock = threading.Lock()
+
+
+def forget_stale_code() -> None:
+    """Drop compiled code that is older than any loop's source: numba's cache watches a function's own file alone,
+    not the files of what it calls, and would go on running what a change elsewhere has replaced."""
+    with _lock:
+        if "cache" in _ready:
+            return
+        _ready.add("cache")
+        folder = Path(__file__).parent
+        sources = [*folder.glob("*.py"), folder.parent / "needle.py"]
+        changed = max(source.stat().st_mtime for source in sources)
+        for index in (folder / "__pycache__").glob("*.nbi"):
+            with suppress(OSError):  # where this may not be written, numba keeps nothing here either
+                if index.stat().st_mtime < changed:
+                    index.unlink()
 
 
 def compile_ahead(

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from echospline.errors import InputError
 from echospline.grid import Floats, RegularGrid
 from echospline.mechanics.anchored_kernel import AnchoredKernel
+from echospline.mechanics.compiled import forget_stale_code
 from echospline.mechanics.fused import FusedState, FusedStep, Setting
 from echospline.mechanics.interaction import (
     CALM,
@@ -306,6 +307,7 @@ class TPSModel:
 
     def _fused(self, precision: Precision) -> FusedStep:
         """Build the fast solver of this scene."""
+        forget_stale_code()
         p, nodes = self.parameters, self.grid.nodes
         sources, at, points = nodes[self.lattice], self.lattice, nodes
         if self.grid.size > FINE:
