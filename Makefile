@@ -33,7 +33,7 @@ check: setup
 
 test: setup
 	tests/install-system
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
 
 format: setup
 	$(BIN)/ruff format .

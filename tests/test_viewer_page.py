@@ -318,9 +318,9 @@ def test_targets_move_with_the_tissue(live):
     live.keyboard.press("e")
     expect(live.locator("#exercise-status")).to_contain_text("Recording")
     hold(live, "ArrowDown", "Number(d.depth) > 9")
-    d = depth(live)
-    shift = 0.2 * d * (1 - ((12 - d) / 6) ** 2) ** 2
-    assert float(live.text_content("#target")) == pytest.approx(12 + shift - d, abs=0.15)
+    # the readout follows the needle by a few frames; a target that stayed would read more than 1 mm less
+    shift = "0.2 * Number(d.depth) * (1 - ((12 - Number(d.depth)) / 6) ** 2) ** 2"
+    wait_until(live, f"Math.abs(Number(text('target')) - (12 + {shift} - Number(d.depth))) < 0.15")
     live.keyboard.press("x")
     expect(live.locator("#exercise-status")).to_be_hidden()
 
