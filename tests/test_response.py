@@ -9,12 +9,14 @@ import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
+from numba import njit
 
 from echospline.errors import InputError, SolverError
 from echospline.grid import Floats, RegularGrid
 from echospline.mechanics.anchored_kernel import AnchoredKernel
 from echospline.mechanics.kernels import Elastic, Kernel, ThinPlate
 from echospline.mechanics.response import NO_TIP, Precision, Response
+from echospline.mechanics.row_sums import BLOCK, sum_block, sum_block_twice
 from echospline.mechanics.spline import factor
 from echospline.mechanics.tip_patch import COEFFICIENTS, DEGREE, NODES, chebyshev
 
@@ -45,12 +47,19 @@ def ask(
     e: Floats | None = None,
     soft: float = 0.0,
 ) -> Floats:
-    slots = response.set_contacts(np.searchsorted(inner(), nodes))
+    table = contacts(nodes)
+    response.set_contacts(table[:, 0])
     at = NO_TIP
     if tip is not None:
         at = np.array([1.0, *tip, *e, 1.0, 0, 0, 0, 0, 0, 0])
         response.prepare(response.scene.conditioned(tip), np.zeros(2), rows=len(NODES))
-    return response.field(slots, q, at, soft)[0]
+    return response.field(table, q, at, soft)[0]
+
+
+def contacts(nodes: Floats) -> Floats:
+    table = np.zeros((len(nodes), 7))
+    table[:, 0] = np.searchsorted(inner(), nodes)
+    return table
 
 
 def refit(
@@ -78,10 +87,11 @@ def test_field_is_that_of_a_refitted_spline(kernel: Kernel, precision: Precision
         scale = max(1.0, float(np.abs(expected).max()))
         assert np.abs(got - expected).max() < within * scale, turn
         anywhere = rng.uniform([0, 0], [32, 24], size=(20, 2))
-        slots = response.set_contacts(np.searchsorted(inner(), nodes))
-        exact = response.spline(slots, q, np.array([1.0, *tip, *e, 1.0, 0, 0, 0, 0, 0, 0]))(anywhere)
+        exact = response.spline(contacts(nodes), q, np.array([1.0, *tip, *e, 1.0, 0, 0, 0, 0, 0, 0]))(
+            anywhere
+        )
         assert np.abs(exact - refit(kernel, nodes, q, tip, e)(anywhere)).max() < 1e-9 * scale
-        tip = np.clip(tip + rng.normal(size=2) * 0.3, [4, 2], [28, 20])
+        tip = np.clip(tip + rng.normal(size=2) * 0.1, [4, 2], [28, 20])
     patched = response.statistics.patches
     assert 0 < patched < 40 if precision == "single" else response.statistics.direct == 40
 
@@ -122,11 +132,55 @@ def test_a_contact_that_joins_at_its_own_value_changes_nothing() -> None:
     assert np.abs(after - before).max() < 1e-12
 
 
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_the_rows_are_the_newton_basis_of_the_contacts_whatever_came_and_went(kernel: Kernel) -> None:
+    rng, response = np.random.default_rng(6), response_of(kernel, "single")
+    scene, built = response.scene, 0
+    centre = scene.conditioned(np.array([15.3, 9.1]))
+    for turn in range(80):
+        response.set_contacts(rng.choice(len(inner()), size=int(rng.integers(0, 14)), replace=False))
+        response.prepare(centre, np.zeros(2), rows=3)
+        n = response.count * scene.components
+        sources = scene.sources[response.source_of[: response.count]]
+        M, gram = np.triu(response.MT[:n, :n]).T, scene.between(sources, sources)
+        assert np.abs(M @ gram @ M.T - np.eye(n)).max(initial=0.0) < 1e-11, turn
+        E, width = M @ scene.rows(sources), len(GRID.nodes) * scene.components
+        assert np.abs(response.rows[response.head :][:n, :width] - E).max(initial=0.0) < 1e-11, turn
+        # the rows of a patch and what the basis carries of them are the columns of its nodes
+        built = int(response.built[0]) * scene.components
+        carried = response.nodes_newton[0, :built, :n] @ E
+        columns = scene.rows(response.nodes[0])[:built]
+        assert np.abs(response.rows[:built, :width] + carried - columns).max() < 1e-11, turn
+        assert np.array_equal(response.single[:built], response.rows[:built].astype(np.float32))
+    assert response.built[0] == len(NODES)
+    assert response.statistics.rebuilt == 0
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+@pytest.mark.parametrize("lines", [1, 2])
+def test_sums_of_rows_are_those_of_numpy(kind: type, lines: int) -> None:
+    rng = np.random.default_rng(7)
+    rows, weights = rng.normal(size=(40, 256)).astype(kind), rng.normal(size=(lines, 40)).astype(kind)
+    order = rng.permutation(40)[:33]
+    out = np.full((lines, BLOCK), np.nan, dtype=kind)
+    loop = sum_block if lines == 1 else sum_block_twice
+
+    @njit
+    def call(rows: Floats, offsets: Floats, weights: Floats, count: int, start: int, out: Floats) -> None:
+        loop(rows, offsets, weights, count, start, out)
+
+    for count in (0, 1, 33):
+        for start in (0, 64, 192):
+            call(rows, order * 256, weights, count, start, out)
+            expected = weights[:, :count] @ rows[order[:count], start : start + BLOCK]
+            np.testing.assert_allclose(out, expected, rtol=1e-4 if kind == np.float32 else 1e-12, atol=1e-5)
+
+
 def test_rounding_past_the_limit_rebuilds_and_says_so() -> None:
     response = response_of(ThinPlate(), "double")
     nodes, q = inner()[[20, 34, 51]], np.ones((3, 2))
     expected = ask(response, nodes, q)
-    response.inverse[0, 0] *= 1.0 + 1e-3
+    response.MT[0, 0] *= 1.0 + 1e-3
     response.rows[response.head] *= 1.0 + 1e-3
     again = ask(response, inner()[[20, 34, 51, 60]], np.vstack([q, expected[inner()[60]]]))
     assert response.statistics.rebuilt == 1

@@ -50,8 +50,8 @@ def _number_of(_context: Any, _i: Any) -> Any:
     return types.float64(types.int64), generate
 
 
-_bits: Any = intrinsic(_bits_of)
-_number: Any = intrinsic(_number_of)
+bits: Any = intrinsic(_bits_of)
+number: Any = intrinsic(_number_of)
 
 
 @njit(**OPTIONS)
@@ -60,9 +60,9 @@ def ln(x: float) -> Any:
 
     x = m 2^e with m between sqrt(1/2) and sqrt(2), and ln m = 2 artanh((m - 1) / (m + 1)) as its series.
     """
-    i = _bits(x)
+    i = bits(x)
     e = (i - ROOT_HALF) >> 52
-    m = _number(i - (e << 52))
+    m = number(i - (e << 52))
     s = (m - 1.0) / (m + 1.0)
     z = s * s
     p = 1.0 / 19.0
@@ -119,49 +119,64 @@ def kernel_rows(
 
 
 @njit(**OPTIONS)
+def _add_two(
+    a: Any, b: Any, wa: Any, wb: Any, first: int, count: int, rows: Any, start: int, stop: int
+) -> None:
+    """a += wa @ rows and b += wb @ rows: four rows at a time, then two, then one."""
+    n, j = stop - start, 0
+    while j + 3 < count:
+        h0, h1 = rows[first + j, start:stop], rows[first + j + 1, start:stop]
+        h2, h3 = rows[first + j + 2, start:stop], rows[first + j + 3, start:stop]
+        a0, a1, a2, a3 = wa[j], wa[j + 1], wa[j + 2], wa[j + 3]
+        b0, b1, b2, b3 = wb[j], wb[j + 1], wb[j + 2], wb[j + 3]
+        for t in range(n):
+            a[t] += a0 * h0[t] + a1 * h1[t] + a2 * h2[t] + a3 * h3[t]
+            b[t] += b0 * h0[t] + b1 * h1[t] + b2 * h2[t] + b3 * h3[t]
+        j += 4
+    if j + 1 < count:
+        h0, h1 = rows[first + j, start:stop], rows[first + j + 1, start:stop]
+        a0, a1, b0, b1 = wa[j], wa[j + 1], wb[j], wb[j + 1]
+        for t in range(n):
+            a[t] += a0 * h0[t] + a1 * h1[t]
+            b[t] += b0 * h0[t] + b1 * h1[t]
+        j += 2
+    if j < count:
+        h0, a0, b0 = rows[first + j, start:stop], wa[j], wb[j]
+        for t in range(n):
+            a[t] += a0 * h0[t]
+            b[t] += b0 * h0[t]
+
+
+@njit(**OPTIONS)
+def _add_one(a: Any, wa: Any, first: int, count: int, rows: Any, start: int, stop: int) -> None:
+    """a += wa @ rows."""
+    n, j = stop - start, 0
+    while j + 3 < count:
+        h0, h1 = rows[first + j, start:stop], rows[first + j + 1, start:stop]
+        h2, h3 = rows[first + j + 2, start:stop], rows[first + j + 3, start:stop]
+        a0, a1, a2, a3 = wa[j], wa[j + 1], wa[j + 2], wa[j + 3]
+        for t in range(n):
+            a[t] += a0 * h0[t] + a1 * h1[t] + a2 * h2[t] + a3 * h3[t]
+        j += 4
+    while j < count:
+        h0, a0 = rows[first + j, start:stop], wa[j]
+        for t in range(n):
+            a[t] += a0 * h0[t]
+        j += 1
+
+
+@njit(**OPTIONS)
 def add_range(
     out: Any, at: int, weights: Any, first: int, count: int, rows: Any, start: int, stop: int
 ) -> None:
     """out[:, at : at + stop - start] += weights[:, :count] @ rows[first : first + count, start:stop]."""
-    r, n = out.shape[0], stop - start
-    i = 0
+    r, n, i = out.shape[0], stop - start, 0
     while i + 1 < r:
         a, b = out[i, at : at + n], out[i + 1, at : at + n]
-        j = 0
-        while j + 3 < count:
-            h0, h1 = rows[first + j, start:stop], rows[first + j + 1, start:stop]
-            h2, h3 = rows[first + j + 2, start:stop], rows[first + j + 3, start:stop]
-            a0, a1, a2, a3 = weights[i, j], weights[i, j + 1], weights[i, j + 2], weights[i, j + 3]
-            b0, b1 = weights[i + 1, j], weights[i + 1, j + 1]
-            b2, b3 = weights[i + 1, j + 2], weights[i + 1, j + 3]
-            for t in range(n):
-                a[t] += a0 * h0[t] + a1 * h1[t] + a2 * h2[t] + a3 * h3[t]
-                b[t] += b0 * h0[t] + b1 * h1[t] + b2 * h2[t] + b3 * h3[t]
-            j += 4
-        while j < count:
-            h0 = rows[first + j, start:stop]
-            a0, b0 = weights[i, j], weights[i + 1, j]
-            for t in range(n):
-                a[t] += a0 * h0[t]
-                b[t] += b0 * h0[t]
-            j += 1
+        _add_two(a, b, weights[i], weights[i + 1], first, count, rows, start, stop)
         i += 2
     if i < r:
-        a = out[i, at : at + n]
-        j = 0
-        while j + 3 < count:
-            h0, h1 = rows[first + j, start:stop], rows[first + j + 1, start:stop]
-            h2, h3 = rows[first + j + 2, start:stop], rows[first + j + 3, start:stop]
-            a0, a1, a2, a3 = weights[i, j], weights[i, j + 1], weights[i, j + 2], weights[i, j + 3]
-            for t in range(n):
-                a[t] += a0 * h0[t] + a1 * h1[t] + a2 * h2[t] + a3 * h3[t]
-            j += 4
-        while j < count:
-            h0 = rows[first + j, start:stop]
-            a0 = weights[i, j]
-            for t in range(n):
-                a[t] += a0 * h0[t]
-            j += 1
+        _add_one(out[i, at : at + n], weights[i], first, count, rows, start, stop)
 
 
 @njit(**OPTIONS)
@@ -170,30 +185,6 @@ def add_product(out: Any, weights: Any, rows: Any) -> None:
     n, m = rows.shape[1], rows.shape[0]
     for start in range(0, n, CHUNK):
         add_range(out, start, weights, 0, m, rows, start, min(n, start + CHUNK))
-
-
-@njit(**OPTIONS)
-def update_rows(
-    rows: Any, single: Any, first: int, count: int, weights: Any, by: Any, start: int, stop: int
-) -> None:
-    """rows[first : first + count, start:stop] += weights (count, r) @ by (r, stop - start), and the same rows in
-    single precision beside them."""
-    r, n = by.shape[0], stop - start
-    for j in range(count):
-        row, copy = rows[first + j, start:stop], single[first + j, start:stop]
-        i = 0
-        while i + 1 < r:
-            w, v = weights[j, i], weights[j, i + 1]
-            b, d = by[i, :n], by[i + 1, :n]
-            for t in range(n):
-                row[t] += w * b[t] + v * d[t]
-            i += 2
-        if i < r:
-            w, b = weights[j, i], by[i, :n]
-            for t in range(n):
-                row[t] += w * b[t]
-        for t in range(n):
-            copy[t] = row[t]
 
 
 _ready: set[str] = set()

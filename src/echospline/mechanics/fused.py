@@ -8,32 +8,22 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import hypot, inf
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from echospline.grid import Floats, RegularGrid
 from echospline.mechanics.anchored_kernel import AnchoredKernel
 from echospline.mechanics.compiled import compile_ahead
-from echospline.mechanics.compiled_step import (
-    CONTACTS,
-    NOT_YET,
-    SAME_PLACE,
-    allowed,
-    move,
-    needle,
-    slots_of,
-    step,
-    value_before,
-)
+from echospline.mechanics.compiled_step import CONTACTS, NOT_YET, SAME_PLACE, allowed, move, step
 from echospline.mechanics.interaction import LET_GO, largest_share
 from echospline.mechanics.kernels import ThinPlate
 from echospline.mechanics.pixel_field import PixelField
-from echospline.mechanics.response import NO_TIP, Precision, Quantities, Response
+from echospline.mechanics.response import NO_TIP, Precision, Response
 from echospline.mechanics.spline import Spline
-from echospline.mechanics.tip_patch import COEFFICIENTS, DEGREE, HALF_WIDTH
+from echospline.mechanics.tip_patch import NODES
+from echospline.mechanics.touch import needle
 from echospline.needle import NeedlePose
 
 PLAIN = np.empty(0)
@@ -45,9 +35,9 @@ class FusedState(NamedTuple):
     Parameters
     ----------
     landmarks : ndarray, shape (k, 7)
-        Contacts, `compiled_step.COLUMNS`, ascending.
+        Contacts, `touch.COLUMNS`, ascending.
     tip : ndarray, shape (12,)
-        The tip's own landmark and the last pose, `compiled_step.TIP`.
+        The tip's own landmark and the last pose, `touch.TIP`.
     mesh : ndarray, shape (n, 2)
         Displacement of the points of the response, mm.
     held_back : int
@@ -67,9 +57,9 @@ class Setting:
     Parameters
     ----------
     numbers : ndarray, shape (10,)
-        sigma, delta, alpha1, alpha2, alpha3, length, drag, gap, 1 for immediate loading, 1 for a tip on a node.
+        `touch.SETTING`; 1 for immediate loading, 1 for a tip on a node.
     places : ndarray, shape (2, K)
-        The nodes that may become contacts, mm.
+        The nodes that may become contacts, line by line of the lattice (y, then x ascending), mm.
     walls : ndarray, shape (4,)
         Clamped edges: x of left and right, y of top and bottom; infinite where free, mm.
     posts : ndarray, shape (j, 2)
@@ -102,9 +92,8 @@ class FusedStep:
     def _begin(self, response: Response, setting: Setting) -> None:
         self.response = response
         self.setting = setting
-        K, n = len(response.at), len(response.scene.points)
-        self.marks, self.alongs = np.empty(K, dtype=np.int64), np.empty(K)
-        self.points = n
+        self.points = len(response.scene.points)
+        self.lines = _lines(setting.places)
         self.lock = threading.Lock()
 
     def rest(self) -> FusedState:
@@ -129,26 +118,25 @@ class FusedStep:
         return np.array((x, y, moves, soft, before))
 
     def _advance(self, state: FusedState, pose: NeedlePose, dt: float) -> FusedState:
-        s, r, a = self.setting, self.response, self.response.scene
-        place = self._place(state, pose)
+        s, r = self.setting, self.response
+        place, before = self._place(state, pose), state.tip
         (ex, ey), (tx, ty) = pose.entry, pose.tip
         while True:
-            outcome, table, tip, mesh, how = step(
-                ex, ey, tx, ty, pose.speed, dt, place, s.places, r.at, state.mesh, state.landmarks, state.tip, s.numbers,
-                s.walls, s.posts, a.form, a.frame, a.anchors, a.L_inverse, a.sources, a.felt, r.slots, r.slot_of_source,
-                r.count, r.inverse, a.columns, a.table, r.rows, r.single, r.product, r.head, r.square, COEFFICIENTS, DEGREE,
-                r.toq, r.near, r.rough, self.marks, self.alongs,
+            outcome, table, tip, mesh, how, lacks = step(
+                r.basis, s.places, self.lines, s.posts, s.walls, s.numbers, state.landmarks, before, state.mesh, place,
+                ex, ey, tx, ty, pose.speed, dt,
             )  # fmt: skip
             if outcome != CONTACTS:
                 break
-            r.set_contacts(table[:, 0].astype(np.int64))
+            r.set_contacts(table[:, 0])
         held_back = state.held_back
         if outcome == NOT_YET:
             table, tip, mesh, held_back = self._finish(state, pose, dt, place, table)
         if how == 2:
             r.statistics.direct += 1
-            if hypot(tx - state.tip[9], ty - state.tip[10]) * 8.0 < HALF_WIDTH:
-                r.prepare((tip[1:3] - a.centre) / a.scale, np.multiply(pose.axis, np.sign(pose.speed)))
+        if lacks:
+            a = r.scene
+            r.prepare((tip[1:3] - a.centre) / a.scale, (tip[1:3] - before[1:3]) / a.scale)
         return FusedState(table, tip, mesh, held_back)
 
     def _finish(
@@ -158,21 +146,18 @@ class FusedStep:
 
         Held back: landmarks move only so far that no node moves beyond the limit, by the field's linearity.
         """
-        s, r, a = self.setting, self.response, self.response.scene
-        before, was, at, held_back = state.tip, state.mesh, self.response.at, state.held_back
+        s, r = self.setting, self.response
+        before, was, at, held_back, k = state.tip, state.mesh, r.at, state.held_back, len(table)
         numbers = needle(*pose.entry, *pose.tip, pose.speed, dt, bool(s.numbers[8]), before, place)
-        slot_of = slots_of(table, r.slot_of_source)
-        q, tip, free, on_tip, soft, quantities = move(
-            table, before, s.places, numbers, s.numbers, s.walls, s.posts, a.form, a.frame, a.anchors, a.L_inverse, a.sources,
-            a.felt, r.slots, slot_of, r.inverse,
-        )  # fmt: skip
+        tip, on_tip, soft, _ = move(r.basis, s.places, s.posts, s.walls, s.numbers, table, before, numbers)
+        q, free = r.q[:k].copy(), r.free[:k].copy()
         limit, _ = allowed(table, before, q, free, numbers, s.numbers)
-        mesh, change = r.field(slot_of, q, tip, soft, on_tip, at, was)
+        mesh, change = r.field(table, q, tip, soft, on_tip, was)
         if change > limit * limit:
             start, stay = table[:, 2:4].copy(), tip.copy()
             if tip[0] > 0.0:
-                stay[3:5] = self._value_before(table, before, tip, slot_of, quantities, float(numbers[14]))
-            rest, _ = r.field(slot_of, start, stay, soft, on_tip)
+                stay[3:5] = self._value_before(table, before, tip, float(numbers[14]))
+            rest, _ = r.field(table, start, stay, soft, on_tip)
             share = largest_share(rest[at] - was[at], mesh[at] - was[at], limit)
             q = start + share * (q - start)
             tip[3:5] = stay[3:5] + share * (tip[3:5] - stay[3:5])
@@ -182,32 +167,18 @@ class FusedStep:
         keep = (table[:, 1] > 0.0) | (np.hypot(*(q - free).T) > LET_GO)
         if not keep.all():
             table = table[keep]
-            slot_of = r.set_contacts(table[:, 0].astype(np.int64))
-            mesh, _ = r.field(slot_of, table[:, 2:4].copy(), tip, soft, self._on_tip(table, tip))
+            r.set_contacts(table[:, 0])
+            mesh, _ = r.field(table, table[:, 2:4].copy(), tip, soft, self._on_tip(table, tip))
         tip[11] = np.hypot(*mesh[at].T).max()
         return table, tip, mesh, held_back
 
-    def _value_before(
-        self,
-        table: Floats,
-        before: Floats,
-        tip: Floats,
-        slot_of: NDArray[np.int64],
-        quantities: Quantities,
-        soft: float,
-    ) -> tuple[float, float]:
+    def _value_before(self, table: Floats, before: Floats, tip: Floats, soft: float) -> tuple[float, float]:
         """Field at the tip's landmark before the step, mm."""
-        r, q = self.response, table[:, 2:4].copy()
-        x, y = (tip[1:3] - r.scene.centre) / r.scene.scale
-        bx, by = (before[1:3] - r.scene.centre) / r.scene.scale
+        q = table[:, 2:4].copy()
         spoken = self._on_tip(table, before)
         if spoken >= 0:
             q[spoken], before = before[3:5], NO_TIP
-        old = r.at_point(np.array([bx, by])) if before[0] > 0.0 else quantities
-        value: tuple[float, float] = value_before(
-            r.scene.form, quantities[3], quantities[0], x, y, before, bx, by, soft, q, slot_of, old
-        )
-        return value
+        return self.response.before(table, q, before, soft, tip[1:3])
 
     def _on_tip(self, table: Floats, tip: Floats) -> int:
         """Contact for which a tip's landmark speaks, or -1."""
@@ -221,10 +192,9 @@ class FusedStep:
     def fine(self, state: FusedState, field: PixelField) -> Floats:
         """Displacement of a fine mesh, shape (n, 2) mm."""
         with self.lock:
-            slot_of = self.response.set_contacts(state.landmarks[:, 0].astype(np.int64))
+            self.response.set_contacts(state.landmarks[:, 0])
             on_tip = self._on_tip(state.landmarks, state.tip)
-            q = np.ascontiguousarray(state.landmarks[:, 2:4])
-            return field(self.response, state.mesh, slot_of, q, state.tip, self._soft(state), on_tip)
+            return field(self.response, state.mesh, state.landmarks, state.tip, self._soft(state), on_tip)
 
     def _soft(self, state: FusedState) -> float:
         """Softness of a state's tip landmark."""
@@ -238,9 +208,9 @@ class FusedStep:
             return None
         with self.lock:
             soft = self._soft(state)
-            slot_of = self.response.set_contacts(state.landmarks[:, 0].astype(np.int64))
+            self.response.set_contacts(state.landmarks[:, 0])
             on_tip = self._on_tip(state.landmarks, state.tip)
-            return self.response.spline(slot_of, state.landmarks[:, 2:4], state.tip, soft, on_tip)
+            return self.response.spline(state.landmarks, state.landmarks[:, 2:4], state.tip, soft, on_tip)
 
 
 def _try_out(precision: Precision) -> None:
@@ -258,12 +228,19 @@ def _try_out(precision: Precision) -> None:
     for depth, speed in ((0.5, 1.0), (2.6, 1.0), (2.61, 1.0), (0.3, -1.0), (0.3, 0.0)):
         state = model.advance(state, NeedlePose((3.1, 0.0), (3.1, depth), speed), 0.1)
     r = model.response
-    r.prepare(np.zeros(2), np.zeros(2), rows=r.sources_in_patch)
+    r.prepare(np.zeros(2), np.zeros(2), rows=len(NODES))
     r.set_contacts(np.arange(6))
     r.set_contacts(np.arange(3, 6))
-    q, slots = np.zeros((3, 2)), r.slot_of_source[3:6]
-    r.field(slots, q)
-    quantities = r.at_point(np.zeros(2))
-    value_before(
-        scene.form, quantities[3], quantities[0], 0.0, 0.0, np.ones(12), 0.1, 0.1, 0.0, q, slots, quantities
-    )
+    table = np.zeros((3, 7))
+    table[:, 0] = np.arange(3, 6)
+    q, tip = np.zeros((3, 2)), np.zeros(12)
+    r.field(table, q, tip)
+    r.before(table, q, tip, 0.0, np.ones(2))
+    r.spline(table, q, np.array([1.0, 2.2, 2.1, 0, 0, 1, 1, 0, 0, 0, 0, 0]))
+
+
+def _lines(places: Floats) -> Floats:
+    """Rows of the lattice, as `touch.touched` takes them, shape (j + 1, 2): first place, y."""
+    y, count = places[1], places.shape[1]
+    first = np.flatnonzero(np.diff(y, prepend=np.nan) != 0.0)
+    return np.array([*zip(first, y[first], strict=True), (count, 0.0)], dtype=np.float64).reshape(-1, 2)

@@ -204,8 +204,7 @@ class PixelField:
         self,
         response: Response,
         values: Floats,
-        slot_of: NDArray[np.int64],
-        q: Floats,
+        table: Floats,
         tip: Floats,
         soft: float,
         on_tip: int,
@@ -216,11 +215,11 @@ class PixelField:
         out = np.empty((ny, nx, 2))
         _interpolate(values[: mx * my].reshape(my, mx, 2), *self.taps, out)
         if len(self.patterns):
-            weights = response.spline(slot_of, q, tip, soft, on_tip).weights
+            weights = response.spline(table, table[:, 2:4], tip, soft, on_tip).weights
             if self.scene.components == 2:
                 weights = np.ascontiguousarray(weights.reshape(2, -1).T)
             b, k = len(self.scene.anchors), response.count
-            which = np.concatenate([np.arange(b), b + response.slots[:k]])
+            which = np.concatenate([np.arange(b), b + response.source_of[:k]])
             _add_all(out, self.patterns, self.corners, which, weights[: b + k])
             if len(weights) > b + k:
                 room = np.empty(self.shape)

@@ -1,9 +1,9 @@
 """How the mesh answers the landmarks that move: kept between steps, updated when contacts come and go.
 
-With the anchors held (`anchored_kernel`), contacts C with displacements d move the mesh by H d, H = G_:C P with
-P = (G_CC + D)^-1. H is kept, one row per contact; a step reads it once. A contact that joins or leaves changes H and P by a
-product of one column and one row; nothing is refitted. Rounding that this gathers is watched at the landmarks, and H is
-rebuilt when it grows. The tip moves at every step, so its row cannot be kept; `tip_patch` interpolates it.
+With the anchors held (`anchored_kernel`), contacts C with displacements d move the mesh by G_:C (G_CC + D)^-1 d = E (M d)
+(`basis`). E is kept, one row per contact; a step reads it once. A contact that joins appends a row; one that leaves turns
+the rows after it; nothing is refitted. Rounding that this gathers is watched at the landmarks, and everything is rebuilt when
+it grows. The tip moves at every step, so its row cannot be kept; `tip_column` interpolates it.
 """
 
 from __future__ import annotations
@@ -17,16 +17,20 @@ from numpy.typing import ArrayLike, NDArray
 from echospline.errors import SolverError
 from echospline.grid import Floats
 from echospline.mechanics.anchored_kernel import AnchoredKernel
-from echospline.mechanics.compiled_step import at_point, begin_patch, spread
-from echospline.mechanics.contacts import build_rows, drop, join, misfit
+from echospline.mechanics.basis import Basis, new_basis
+from echospline.mechanics.compiled import CHUNK
+from echospline.mechanics.contacts import change, misfit
+from echospline.mechanics.mesh_field import SIGN, field, field_before
+from echospline.mechanics.row_sums import BLOCK
 from echospline.mechanics.spline import Spline
-from echospline.mechanics.tip_patch import COEFFICIENTS, DEGREE, NODES, TipPatch
+from echospline.mechanics.tip_column import begin_patch, build_rows, meet, points_near
+from echospline.mechanics.tip_patch import AHEAD, COEFFICIENTS, DEGREE, NODES, TipPatch
 
 RESIDUAL = 1e-6
-"""mm; misfit at the landmarks, for displacements of 1 mm, at which H is rebuilt."""
+"""mm; misfit at the landmarks, for displacements of 1 mm, at which the response is rebuilt."""
 
-ROWS_PER_STEP = 3
-"""How many rows of a new patch one step builds: the patch is ready after seven steps, and no step takes long."""
+CATCH_UP = 3
+"""Rows of a patch that one step builds while the tip has none; otherwise one, so that no step takes long."""
 
 LINE = 64
 """Bytes in a cache line."""
@@ -34,8 +38,8 @@ LINE = 64
 Singles = NDArray[np.float32]
 Precision = Literal["single", "double"]
 NO_TIP = np.zeros(12)
+NOT_ASKED = np.empty((0, 2))
 Number = TypeVar("Number", bound=np.generic)
-Quantities = tuple[Floats, Floats, Floats, Floats, Floats]
 
 
 @dataclass
@@ -47,9 +51,11 @@ class Statistics:
     joined, left : int
         Contacts added and removed by an update.
     rebuilt : int
-        How often H was built anew because rounding had grown past `RESIDUAL`.
+        How often the response was built anew because rounding had grown past `RESIDUAL`.
     patches : int
         How often a patch was begun for the tip.
+    built : int
+        Rows of patches so far.
     direct : int
         How often the tip's row was evaluated directly.
     residual : float
@@ -60,24 +66,24 @@ class Statistics:
     left: int = 0
     rebuilt: int = 0
     patches: int = 0
+    built: int = 0
     direct: int = 0
     residual: float = 0.0
 
 
 class Response:
-    """Rows of H for the current contacts, and of the tip, at all points of an `AnchoredKernel`.
+    """The displacement of all points as a product of what is kept and the displacements of the landmarks.
 
-    A workspace: it holds no state of the tissue, only what follows from the set of contacts, so it may be asked about
-    any set at any time; the closer to the last one, the cheaper. Not safe for use by two threads at once.
+    A table of contacts has a row for each, `touch.COLUMNS`, of which only the first column, its source, is read here.
 
     Parameters
     ----------
     scene : AnchoredKernel
-        Anchors, evaluation points, and the sources that may become contacts.
-    precision : {"single", "double"}
-        Of the product that gives the field. Factors are always double. "single" also interpolates the tip's row.
+        Anchors, points and the sources that may become contacts.
     at : ndarray of int, shape (K,)
         Which evaluation point each source is.
+    precision : {"single", "double"}
+        Of the product that gives the field. Factors are always double. "single" also interpolates the tip's row.
     softness : ndarray, shape (K,), optional
         Diagonal D of each source (`AnchoredKernel.compliance`); 0, the default, interpolates.
     """
@@ -94,252 +100,274 @@ class Response:
         self.precision = precision
         self.softness = np.zeros(len(scene.sources)) if softness is None else softness
         self.statistics = Statistics()
-        c = scene.components
-        self.sources_in_patch = len(NODES) if precision == "single" else 0
-        self.head = c * (self.sources_in_patch + 1)
-        """Rows before those of the contacts: those of the tip's patch, then the tip's own when it is evaluated."""
-        self.count = 0
-        self.slot_of_source = np.full(len(scene.sources), -1, dtype=np.int64)
-        self.slots: NDArray[np.int64] = np.empty(0, dtype=np.int64)
-        self.inverse: Floats = np.empty((0, 0))
-        self.gram: Floats = np.empty((0, 0))
-        self.toq: Floats = np.empty((0, c * len(NODES)))
-        # rows as long as whole cache lines, so that all of them begin on one; what is beyond the points stays unused
-        self.rows: Floats = np.empty((0, -(-c * len(scene.points) * 4 // LINE) * LINE // 4))
+        self.patches: list[TipPatch | None] = [None, None]
+        c, Q, m, K = scene.components, len(NODES), len(scene.table), len(scene.sources)
+        self.watched = np.zeros(len(scene.points) if len(scene.points) < 2 * K else 0, dtype=np.int64)
+        if len(self.watched):
+            self.watched[self.at] = SIGN
+        self.head = (2 * Q + 1) * c
+        """Rows before those of the contacts: those of the tip's two patches, then the tip's own when it is evaluated."""
+        self.counted = np.zeros(1, dtype=np.int64)
+        self.contact_of = np.full(K, -1, dtype=np.int64)
+        self.squares, self.built = np.zeros((2, 3)), np.zeros(2, dtype=np.int64)
+        self.nodes, self.nodes_held = np.zeros((2, Q, 2)), np.zeros((2, Q * c, m))
+        self.nodes_own = np.zeros((2, Q * c, Q * c))
+        # rows as long as whole blocks, so that all of them begin on a cache line; what is beyond the points stays zero
+        self.rows: Floats = np.empty((0, -(-c * len(scene.points) // BLOCK) * BLOCK))
         self.single: Singles = np.empty(self.rows.shape, dtype=np.float32)
-        self.product: Floats | Singles = self.rows
+        self.source_of: NDArray[np.int64] = np.empty(0, dtype=np.int64)
+        self.MT: Floats = np.empty((0, 0))
+        self.gram: Floats = np.empty((0, 0))
+        self.nodes_contacts: Floats = np.empty((2, Q * c, 0))
+        self.nodes_newton: Floats = np.empty((2, Q * c, 0))
+        self.close: NDArray[np.int64] = np.empty((2, 0), dtype=np.int64)
+        self._near_room(64)
         self._reserve(32)
-        self._forget_patch()
+
+    @property
+    def count(self) -> int:
+        """Number of contacts."""
+        return int(self.counted[0])
 
     # --- contacts
 
-    def set_contacts(self, sources: ArrayLike) -> NDArray[np.int64]:
-        """Make these the contacts and say in which slot each stands.
+    def set_contacts(self, sources: ArrayLike) -> None:
+        """Make these the contacts.
 
         Parameters
         ----------
         sources : array_like of int, shape (k,)
             Indices of sources, each once.
 
-        Returns
-        -------
-        ndarray of int, shape (k,)
-
         Raises
         ------
         SolverError
             If two of them lie too close together.
         """
-        wanted = np.asarray(sources, dtype=np.int64).reshape(-1)
-        member = np.zeros(len(self.slot_of_source), dtype=bool)
-        member[wanted] = True
-        gone = np.flatnonzero(~member[self.slots[: self.count]])
-        if len(gone):
-            self._drop(gone)
-        new = wanted[self.slot_of_source[wanted] < 0]
-        if len(new):
-            self._join(new)
-        if len(gone) or len(new):
-            worst = misfit(self.inverse, self.gram, self.count * self.scene.components)
+        wanted = np.array(sources, dtype=np.int64).reshape(-1)
+        self._reserve(self.count + len(wanted))
+        joined, left, told_apart = change(self.basis, wanted)
+        if not told_apart:
+            raise SolverError(
+                f"{joined} contacts cannot be told apart from others: they lie too close together; thin them out "
+                "or give them a finite stiffness"
+            )
+        if joined or left:
+            self.statistics.joined += joined
+            self.statistics.left += left
+            worst = misfit(self.basis)
             self.statistics.residual = max(self.statistics.residual, worst)
             if not worst <= RESIDUAL:
                 self.rebuild()
-        return self.slot_of_source[wanted]
 
     def rebuild(self) -> None:
-        """Build H and P anew.
+        """Build E and M anew.
 
         Raises
         ------
         SolverError
             If they cannot be had to `RESIDUAL`.
         """
-        names = self.slots[: self.count].copy()
-        self.count = 0
-        self._forget_patch()
-        self._append(names)
+        names = self.source_of[: self.count].copy()
+        self.forget()
+        _, _, told_apart = change(self.basis, names)
         self.statistics.rebuilt += 1
-        worst = misfit(self.inverse, self.gram, self.count * self.scene.components)
+        worst = misfit(self.basis) if told_apart else np.inf
         if not worst <= RESIDUAL:
             raise SolverError(
                 f"the spline misses its landmarks by {worst:.1e} mm: two of the {len(names)} contacts lie too close "
                 "together; thin them out or give them a finite stiffness"
             )
 
-    def _join(self, new: NDArray[np.int64]) -> None:
-        self._append(new)
-        self.statistics.joined += len(new)
-
-    def _append(self, new: NDArray[np.int64]) -> None:
-        s = self.scene
-        self._reserve(self.count + len(new))
-        patch = self.sources_in_patch if self.patch is not None else 0
-        told_apart = join(
-            s.form, s.columns, s.table, s.sources, s.felt, s.held, new, self.softness[new], self.slots, self.count,
-            self.inverse, self.gram, self.rows, self.single, self.head, patch, self.built, self.at[new], self.toq,
-            self.patch_nodes, self.patch_held,
-        )  # fmt: skip
-        if not told_apart:
-            raise SolverError(
-                f"{len(new)} contacts cannot be told apart from others: they lie too close together; thin them out "
-                "or give them a finite stiffness"
-            )
-        self.count += len(new)
-        self._number()
-
-    def _drop(self, gone: NDArray[np.int64]) -> None:
-        patch = self.sources_in_patch if self.patch is not None else 0
-        drop(
-            self.scene.components, gone, self.slots, self.count, self.inverse, self.gram, self.rows, self.single, self.head,
-            patch, self.built, self.toq,
-        )  # fmt: skip
-        self.count -= len(gone)
-        self.statistics.left += len(gone)
-        self._number()
-
-    def _number(self) -> None:
-        self.slot_of_source[:] = -1
-        self.slot_of_source[self.slots[: self.count]] = np.arange(self.count)
+    def forget(self) -> None:
+        """Begin with no contacts and no patches."""
+        self.counted[0] = 0
+        self.contact_of[:] = -1
+        self.squares[:] = 0.0
+        self.built[:] = 0
+        self.patches = [None, None]
 
     def _reserve(self, contacts: int) -> None:
         """Have room for that many contacts."""
-        have = len(self.slots)
+        have = len(self.source_of)
         if have >= contacts:
             return
         c, room = self.scene.components, max(contacts, 2 * have)
-        self.slots = _grown(self.slots, (room,))
-        self.inverse = _grown(self.inverse, (room * c, room * c))
-        self.gram = _grown(self.gram, (room * c, room * c))
-        self.toq = _grown(self.toq, (room * c, self.toq.shape[1]))
-        shape = (self.head + room * c, self.rows.shape[1])
-        self.rows, self.single = _grown(self.rows, shape), _grown(self.single, shape)
+        self.source_of = _grown(self.source_of, (room,))
+        width = -(-room * c // BLOCK) * BLOCK
+        self.MT, self.gram = _grown(self.MT, (room * c, width)), _grown(self.gram, (room * c, room * c))
+        shape = (2, len(NODES) * c, width)
+        self.nodes_contacts, self.nodes_newton = (
+            _grown(a, shape) for a in (self.nodes_contacts, self.nodes_newton)
+        )
+        self.close = _grown(self.close, (2, room))
+        rows = (self.head + room * c, self.rows.shape[1])
+        self.rows, self.single = _grown(self.rows, rows), _grown(self.single, rows)
+        self._gather()
+
+    def _near_room(self, points: int) -> None:
+        """Have room for that many points close to a patch."""
+        c = self.scene.components
+        self.near = np.zeros((2, points), dtype=np.int64)
+        self.near_count = np.zeros(2, dtype=np.int64)
+        self.near_points = np.zeros((2, 2, points))
+        self.near_U = np.zeros((2, (2 * c - 1) * len(NODES), points))
+
+    def _gather(self) -> None:
+        """Hand everything to the compiled loops."""
+        s, c, room, K = self.scene, self.scene.components, len(self.source_of), len(self.contact_of)
         self.product = self.rows if self.precision == "double" else self.single
+        kind, m = self.product.dtype, len(s.table)
+        width = self.MT.shape[1]
+        starts, node_starts = width * np.arange(room * c), width * c * np.arange(len(NODES))
+        self.met, self.q, self.free = np.zeros(4), np.zeros((room, 2)), np.zeros((room, 2))
+        self.t, cross, d, w = (_aligned((2, width), np.dtype(np.float64)) for _ in range(4))
+        self.basis: Basis = new_basis(
+            s.form, s.frame, s.anchors, s.L_inverse, s.sources, s.felt, s.held, s.columns, s.table, self.at, self.watched,
+            self.softness, self.counted, self.source_of, self.contact_of, self.MT, starts, self.gram, self.rows, self.single,
+            self.product, self.squares, self.built, self.nodes, self.nodes_held, self.nodes_own, self.nodes_contacts,
+            self.nodes_newton, node_starts, self.close, self.near, self.near_count, self.near_points, self.near_U, COEFFICIENTS,
+            self.met, self.t, cross, np.zeros((c, m)), np.zeros((c, m)), np.zeros((1, len(NODES))),
+            np.zeros((2, DEGREE + 1)), np.zeros((c, c)), np.zeros((2, CHUNK)), d, w, self.q, self.free,
+            np.zeros((2, len(self.rows)), kind), np.zeros(len(self.rows), np.int64), _aligned((2, BLOCK), kind),
+            np.zeros(K, np.int64), np.zeros(K),
+        )  # fmt: skip
 
-    # --- the tip's patch
+    # --- the tip's patches
 
-    def _forget_patch(self) -> None:
-        self.patch: TipPatch | None = None
-        self.built = 0
-        self.square = np.zeros(3)
-        self.patch_nodes, self.patch_held = np.empty((0, 2)), np.empty((0, self.scene.table.shape[0]))
-        self.near, self.rough = np.empty(0, dtype=np.int64), np.empty((0, len(NODES)))
+    def prepare(self, tip: Floats, motion: Floats, rows: int | None = None) -> None:
+        """Go on building a patch for where a tip will be soon.
 
-    def prepare(self, tip: Floats, ahead: Floats, rows: int = ROWS_PER_STEP) -> None:
-        """Go on building the patch for a tip (conditioned) that its patch does not hold; ``ahead`` is its direction."""
-        if not self.sources_in_patch:
+        Parameters
+        ----------
+        tip, motion : ndarray, shape (2,)
+            Conditioned; ``motion`` is how far it moves in a step.
+        rows : int, optional
+            How many of its rows to build now.
+        """
+        if self.precision == "double":
             return
-        if self.patch is None or not self.patch.holds(float(tip[0]), float(tip[1])):
-            self._forget_patch()
-            patch = TipPatch.around(tip, ahead, self.scene.anchors, self.scene.scale)
+        x, y = tip + AHEAD * motion
+        ready = self.built == len(NODES)
+        serves = [
+            p is not None and bool(r) and p.holds(*tip) for p, r in zip(self.patches, ready, strict=True)
+        ]
+        holds = [p is not None and p.holds(x, y) for p in self.patches]
+        if (ready & holds).any():
+            return
+        if any(holds):
+            which = holds.index(True)
+        else:
+            which = serves.index(False) if not all(serves) else 0
+            length = float(np.hypot(*motion))
+            heading = motion / length if length > 0 else np.zeros(2)
+            patch = TipPatch.around(np.array([x, y]), heading, self.scene.anchors, self.scene.scale)
             if patch is None:
                 return
-            self._begin(patch)
-        end = min(self.sources_in_patch, self.built + rows)
-        if end > self.built:
-            s = self.scene
-            build_rows(
-                s.form, s.columns, s.table, self.patch_nodes, self.patch_held, self.toq, self.rows, self.single, self.head,
-                self.count, self.built, end,
-            )  # fmt: skip
-            self.built = end
-        if self.patch is not None and self.built == self.sources_in_patch:
-            self.square = np.array([*self.patch.centre, self.patch.half])
+            self._begin(which, patch)
+        rows = (1 if any(serves) else CATCH_UP) if rows is None else rows
+        before = int(self.built[which])
+        build_rows(self.basis, which, rows)
+        self.statistics.built += int(self.built[which]) - before
 
-    def _begin(self, patch: TipPatch) -> None:
-        s = self.scene
-        self.patch, self.patch_nodes = patch, patch.nodes
-        self.patch_held, self.near, self.rough = begin_patch(
-            s.form, patch.nodes, np.array(patch.centre), patch.near, s.anchors, s.L_inverse, s.sources, s.felt, self.slots,
-            self.count, self.inverse, s.columns, self.toq,
-        )  # fmt: skip
+    def _begin(self, which: int, patch: TipPatch) -> None:
+        self.patches[which] = patch
+        self.built[which] = 0
+        self.squares[which] = (*patch.centre, patch.half)
+        self.nodes[which] = patch.nodes
+        while not points_near(self.basis, which):
+            self._near_room(2 * self.near.shape[1])
+            self._gather()
+            self.squares[1 - which] = 0.0  # what was near the other one is forgotten
+            self.patches[1 - which] = None
+        begin_patch(self.basis, which)
         self.statistics.patches += 1
 
     # --- the field
 
-    def at_point(self, point: Floats) -> Quantities:
-        """What a conditioned point has to do with the landmarks (`compiled_step.at_point`)."""
-        s = self.scene
-        quantities: Quantities = at_point(
-            s.form, float(point[0]), float(point[1]), s.anchors, s.L_inverse, s.sources, s.felt, self.slots, self.count,
-            self.inverse,
-        )  # fmt: skip
-        return quantities
-
     def field(
         self,
-        slot_of: NDArray[np.int64],
+        table: Floats,
         q: Floats,
         tip: Floats = NO_TIP,
         soft: float = 0.0,
         on_tip: int = -1,
-        nodes: NDArray[np.int64] | None = None,
-        was: Floats | None = None,
+        was: Floats = NOT_ASKED,
     ) -> tuple[Floats, float]:
         """Displacement of all points.
 
         Parameters
         ----------
-        slot_of : ndarray of int, shape (k,)
-            Slots of the contacts.
+        table : ndarray, shape (k, 7)
+            Contacts; all of those that there are.
         q : ndarray, shape (k, 2)
             Their displacements, mm.
         tip : ndarray, shape (12,)
-            As `compiled_step.TIP`, mm.
+            As `touch.TIP`, mm.
         soft : float
             Softness of the tip's landmark.
         on_tip : int
             Contact for which the tip speaks, or -1.
-        nodes, was : ndarray, optional
-            Points at which the change since an earlier field is asked for.
+        was : ndarray, shape (n, 2), optional
+            An earlier field, for ``change``.
 
         Returns
         -------
         field : ndarray, shape (n, 2)
             mm.
         change : float
-            Square of the largest change at ``nodes``, mm^2.
+            Square of the largest change at the sources since the earlier field, mm^2; 0 when not asked.
         """
-        s = self.scene
-        nodes = np.empty(0, dtype=np.int64) if nodes is None else nodes
-        was = np.empty((0, 2)) if was is None else was
-        place = (tip[1:3] - s.centre) / s.scale
-        quantities = self.at_point(place)
-        mesh, change, how, _ = spread(
-            s.form, s.frame, s.columns, s.table, self.rows, self.single, self.product, self.head, slot_of, q, tip, on_tip,
-            soft, quantities, self.square, COEFFICIENTS, DEGREE, self.toq, self.near, self.rough, nodes, was,
-        )  # fmt: skip
+        mesh, moved, how, _ = field(self.basis, table, q, tip, on_tip, soft, was)
         self.statistics.direct += how == 2
-        return mesh, change
+        return mesh, moved
+
+    def before(
+        self, table: Floats, q: Floats, tip: Floats, soft: float, point: Floats
+    ) -> tuple[float, float]:
+        """Field of contacts and an earlier tip at a point (2,) mm, mm."""
+        value: tuple[float, float] = field_before(
+            self.basis, table, q, tip, soft, float(point[0]), float(point[1])
+        )
+        return value
 
     def spline(
-        self, slot_of: NDArray[np.int64], q: Floats, tip: Floats = NO_TIP, soft: float = 0.0, on_tip: int = -1
+        self, table: Floats, q: Floats, tip: Floats = NO_TIP, soft: float = 0.0, on_tip: int = -1
     ) -> Spline:
         """Return the same field as a spline that can be evaluated anywhere, in double precision."""
         s, c, n = self.scene, self.scene.components, self.count * self.scene.components
+        d = np.zeros((self.count, 2))
         own = q.copy()
         if on_tip >= 0:
             own[on_tip] = tip[3:5]
-        d = np.zeros((self.count, 2))
-        d[slot_of] = own
+        d[self.contact_of[table[:, 0].astype(np.int64)]] = own
         d = d if c == 1 else d.reshape(-1, 1)
-        slots = self.slots[: self.count]
-        weights, where = self.inverse[:n, :n] @ d, s.sources[slots]
-        coupling = s.held[(c * slots[:, None] + np.arange(c)).ravel()].T
+        M = np.triu(self.MT[:n, :n]).T
+        w = M @ d
+        sources = self.source_of[: self.count]
+        weights, where = M.T @ w, s.sources[sources]
+        coupling = s.held[(c * sources[:, None] + np.arange(c)).ravel()].T
         if tip[0] > 0 and on_tip < 0:
             place = (tip[1:3] - s.centre) / s.scale
-            _, _, _, h, free = self.at_point(place)
-            gap = tip[3:5].reshape(c, 2 // c) - h @ d
-            w = np.linalg.solve(free + soft * np.eye(c), gap)
-            weights, where = np.vstack([weights - h.T @ w, w]), np.vstack([where, place])
+            meet(self.basis, float(place[0]), float(place[1]), False)
+            t, own = self.t[:c, :n], self.met[1:2] if c == 1 else self.met[[1, 2, 2, 3]]
+            gap = tip[3:5].reshape(c, 2 // c) - t @ w
+            s_tip = np.linalg.solve(own.reshape(c, c) + soft * np.eye(c), gap)
+            weights, where = np.vstack([weights - M.T @ (t.T @ s_tip), s_tip]), np.vstack([where, place])
             coupling = np.hstack([coupling, s.coupling(place[None])])
         return s.spline(where, weights, coupling)
 
 
-def _grown(array: NDArray[Number], shape: tuple[int, ...]) -> NDArray[Number]:
-    """Return a larger array of zeros that begins with this one, on the boundary of a cache line."""
-    size = int(np.prod(shape)) * array.itemsize
+def _aligned(shape: tuple[int, ...], kind: np.dtype[Number]) -> NDArray[Number]:
+    """Return zeros that begin on the boundary of a cache line: half as fast again to read as others."""
+    size = int(np.prod(shape)) * kind.itemsize
     room = np.zeros(size + LINE, dtype=np.uint8)
     start = -room.ctypes.data % LINE
-    grown = room[start : start + size].view(array.dtype).reshape(shape)
+    return room[start : start + size].view(kind).reshape(shape)
+
+
+def _grown(array: NDArray[Number], shape: tuple[int, ...]) -> NDArray[Number]:
+    """Return a larger aligned array of zeros that begins with this one."""
+    grown = _aligned(shape, array.dtype)
     grown[tuple(slice(n) for n in array.shape)] = array
     return grown

@@ -16,13 +16,13 @@ import numpy as np
 
 from echospline.grid import Floats
 
-DEGREE = 5
-"""Total degree of the interpolant: 21 points."""
+DEGREE = 3
+"""Total degree of the interpolant: 10 points."""
 
-HALF_WIDTH = 0.4
+HALF_WIDTH = 0.2
 """mm; half the side of a patch."""
 
-NEAR = 12.5
+NEAR = 20.0
 """Half-widths around the centre within which kernels are evaluated exactly."""
 
 SMALLEST = 0.02
@@ -59,6 +59,12 @@ def chebyshev(points: Floats, degree: int) -> Floats:
 
 NODES = padua(DEGREE)
 COEFFICIENTS = np.linalg.inv(chebyshev(NODES, DEGREE))
+
+AHEAD = len(NODES) + 2
+"""Steps before a tip leaves its patch that the next one is begun: a row each, and two to spare."""
+
+LASTS = 6
+"""Steps that a tip needs at least for half a width: a faster one costs less without patches, one row a step."""
 
 
 @dataclass(frozen=True)

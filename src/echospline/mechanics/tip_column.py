@@ -1,0 +1,320 @@
+"""The column of G at the tip, which moves at every step: interpolated inside a patch (`tip_patch`), or evaluated.
+
+Two patches, so that the next one is ready before the tip leaves the one that it is in.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from echospline.mechanics.compiled import CHUNK, OPTIONS, add_range, kernel, kernel_rows
+from echospline.mechanics.contacts import (
+    contacts_and_nodes,
+    keep,
+    smooth_part,
+    source_rows,
+    times_M,
+)
+from echospline.mechanics.row_sums import BLOCK, sum_block
+from echospline.mechanics.tip_patch import DEGREE, NEAR
+
+STALE = 5.0
+"""How many times what is left of a tip contacts may carry of it before they are taken out of its patch's rows."""
+
+
+@njit(**OPTIONS)
+def felt_at(b: Any, x: float, y: float, felt: Any) -> None:
+    """[U_pB P_p] of a point, (c, m)."""
+    form, anchors = b.form, b.anchors
+    c, n, m = int(form[0]), anchors.shape[0], felt.shape[1]
+    for i in range(n):
+        xx, xy, yy = kernel(form, x - anchors[i, 0], y - anchors[i, 1])
+        felt[0, i] = xx
+        if c == 2:
+            felt[0, n + i] = felt[1, i] = xy
+            felt[1, n + i] = yy
+    if c == 1:
+        felt[0, m - 3], felt[0, m - 2], felt[0, m - 1] = 1.0, x, y
+    else:
+        felt[0, m - 3], felt[0, m - 2], felt[0, m - 1] = 1.0, 0.0, -y
+        felt[1, m - 3], felt[1, m - 2], felt[1, m - 1] = 0.0, 1.0, x
+
+
+@njit(**OPTIONS)
+def held_of(L_inverse: Any, felt: Any, held: Any) -> None:
+    """L_B^-1 of [U_pB P_p], (c, m)."""
+    for a in range(felt.shape[0]):
+        one = felt[a]
+        for i in range(felt.shape[1]):
+            line, value = L_inverse[i], 0.0
+            for j in range(felt.shape[1]):
+                value += one[j] * line[j]
+            held[a, i] = value
+
+
+@njit(**OPTIONS)
+def patch_at(b: Any, x: float, y: float) -> Any:
+    """The patch that is ready and holds a point, or -1."""
+    for p in range(2):
+        square = b.squares[p]
+        ready = square[2] > 0.0 and b.built[p] == b.shares.shape[1]
+        if ready and abs(x - square[0]) <= square[2] and abs(y - square[1]) <= square[2]:
+            return p
+    return -1
+
+
+@njit(**OPTIONS)
+def shares_at(square: Any, x: float, y: float, coefficients: Any, T: Any, shares: Any) -> None:
+    """Shares of the interpolation points in the value at (x, y); ``T`` is room for the polynomials."""
+    X, Y = T[0], T[1]
+    u, v = (x - square[0]) / square[2], (y - square[1]) / square[2]
+    X[0] = Y[0] = 1.0
+    X[1], Y[1] = u, v
+    for i in range(2, DEGREE + 1):
+        X[i] = 2.0 * u * X[i - 1] - X[i - 2]
+        Y[i] = 2.0 * v * Y[i - 1] - Y[i - 2]
+    shares[:] = 0.0
+    at = 0
+    for i in range(DEGREE + 1):
+        for j in range(DEGREE + 1 - i):
+            w, line = X[i] * Y[j], coefficients[at]
+            for t in range(shares.shape[0]):
+                shares[t] += w * line[t]
+            at += 1
+
+
+@njit(**OPTIONS)
+def combine_nodes(b: Any, lines: Any, out: Any) -> None:
+    """Value at the tip for each contact, from those at the nodes: every c-th of ``lines`` times a node's share."""
+    for start in range(0, b.count[0] * int(b.form[0]), BLOCK):
+        sum_block(lines, b.node_starts, b.shares, b.shares.shape[1], start, out[:, start:])
+
+
+@njit(**OPTIONS)
+def newton_of_node(b: Any, patch: int, i: int, newton: Any) -> None:
+    """What the contacts carry of the column of a node, i = node c + component of the patch: newton (1, k c)."""
+    form, between = b.form, b.nodes_contacts[patch]
+    c, k = int(form[0]), b.count[0]
+    x, y, a = b.nodes[patch, i // c, 0], b.nodes[patch, i // c, 1], i % c
+    cross = np.empty((1, k * c))
+    for j in range(k):
+        s = b.source_of[j]
+        xx, xy, yy = kernel(form, x - b.sources[s, 0], y - b.sources[s, 1])
+        for e in range(c):
+            cross[0, j * c + e] = between[i, j * c + e]
+            if b.close[patch, j]:
+                cross[0, j * c + e] += xx if a + e == 0 else (yy if a + e == 2 else xy)
+    times_M(b, cross, newton)
+
+
+@njit(**OPTIONS)
+def renew(b: Any, patch: int, first: int) -> None:
+    """Take out of a patch's rows what the contacts from the scalar ``first`` on, that joined since, carry of them."""
+    c, kc, N = int(b.form[0]), b.count[0] * int(b.form[0]), b.rows.shape[1]
+    Qc, head = b.nodes.shape[1] * c, b.rows.shape[0] - b.MT.shape[0]
+    newton, minus = np.empty((1, b.MT.shape[1])), np.empty((Qc, kc - first))
+    for i in range(Qc):
+        newton_of_node(b, patch, i, newton)
+        for z in range(first, kc):  # rows of one patch may be of different age
+            minus[i, z - first] = b.nodes_newton[patch, i, z] - newton[0, z]
+            b.nodes_newton[patch, i, z] = newton[0, z]
+    rows = b.rows[patch * Qc : (patch + 1) * Qc]
+    for start in range(0, N, CHUNK):
+        stop = min(N, start + CHUNK)
+        add_range(rows, start, minus, head + first, kc - first, b.rows, start, stop)
+        b.single[patch * Qc : (patch + 1) * Qc, start:stop] = rows[:, start:stop]
+
+
+@njit(**OPTIONS)
+def meet(b: Any, x: float, y: float, patched: bool) -> None:
+    """What a point has to do with the landmarks, in double precision: fills ``met``, ``cross``, ``t``, and ``shares`` where
+    a patch (``patched``: may be used) holds it, otherwise ``tip_felt`` and ``tip_held``."""
+    form, sources, source_of, cross, met, t = b.form, b.sources, b.source_of, b.cross, b.met, b.t
+    c, k = int(form[0]), b.count[0]
+    p = patch_at(b, x, y) if patched else -1
+    met[0] = p
+    own = b.own
+    own[:, :] = 0.0
+    if p >= 0:
+        shares, Q = b.shares[0], b.shares.shape[1]
+        shares_at(b.squares[p], x, y, b.coefficients, b.polynomials, shares)
+        G = b.nodes_own[p]
+        for a in range(c):
+            combine_nodes(b, b.nodes_contacts[p, a:], cross[a:])
+        for j in range(k):
+            if b.close[p, j] == 0:
+                continue
+            s = source_of[j]
+            xx, xy, yy = kernel(form, x - sources[s, 0], y - sources[s, 1])
+            cross[0, j * c] += xx
+            if c == 2:
+                cross[0, 2 * j + 1] += xy
+                cross[1, 2 * j] += xy
+                cross[1, 2 * j + 1] += yy
+        for i in range(Q):
+            for a in range(c):
+                line = G[i * c + a]
+                for e in range(c):
+                    value = 0.0
+                    for q in range(Q):
+                        value += shares[q] * line[q * c + e]
+                    own[a, e] += shares[i] * value
+    else:
+        felt, held = b.tip_felt, b.tip_held
+        felt_at(b, x, y, felt)
+        held_of(b.L_inverse, felt, held)
+        for j in range(k):
+            s = source_of[j]
+            xx, xy, yy = kernel(form, x - sources[s, 0], y - sources[s, 1])
+            for a in range(c):
+                for e in range(c):
+                    value = xx if a + e == 0 else (yy if a + e == 2 else xy)
+                    cross[a, j * c + e] = value + smooth_part(b.felt, s * c + e, held, a)
+        for a in range(c):
+            for e in range(c):
+                own[a, e] = smooth_part(felt, a, held, e)
+    for a in range(c):
+        times_M(b, cross[a:], t[a:])
+    xx, xy, yy = kernel(form, 0.0, 0.0)
+    for a in range(c):
+        own[a, a] += xx
+        for e in range(c):
+            for i in range(k * c):
+                own[a, e] -= t[a, i] * t[e, i]
+    met[1] = own[0, 0]
+    if c == 2:
+        met[2], met[3] = 0.5 * (own[0, 1] + own[1, 0]), own[1, 1]
+    if p >= 0:
+        # contacts that joined since the patch was built: its rows still hold what those carry by now. Once that is most of
+        # them, what is left of the tip would be the difference of large numbers in single precision
+        first, joined = k * c, 0.0
+        while first > 0 and b.nodes_newton[p, 0, first - 1] == 0.0:
+            first -= 1
+            for a in range(c):
+                joined += t[a, first] * t[a, first]
+        if joined > STALE * (met[1] + met[3]):
+            renew(b, p, first)
+
+
+@njit(**OPTIONS)
+def tip_row(b: Any, x: float, y: float) -> None:
+    """Evaluate the column at a point that `meet` has just met, less what the contacts explain, into its own rows."""
+    c, n = int(b.form[0]), b.points.shape[1]
+    own, kc = 2 * b.nodes.shape[1] * c, b.count[0] * c
+    xy, width = np.empty((1, 2)), CHUNK // c
+    xy[0, 0], xy[0, 1] = x, y
+    minus_held, minus_t, out = -b.tip_held, -b.t[:, :kc], np.empty((c, c * width))
+    for start in range(0, n, width):
+        w = min(n, start + width) - start
+        source_rows(b, xy, minus_held, minus_t, start, start + w, out)
+        for a in range(c):
+            for e in range(c):
+                keep(b.rows, b.single, own + a, e * n + start, out[a, e * w : (e + 1) * w])
+
+
+@njit(**OPTIONS)
+def points_near(b: Any, patch: int) -> Any:
+    """List the points close to a patch; False where there is no room for them all."""
+    square, points, near = b.squares[patch], b.points, b.near[patch]
+    count, reach2 = 0, (NEAR * square[2]) ** 2
+    for i in range(points.shape[1]):
+        dx, dy = points[0, i] - square[0], points[1, i] - square[1]
+        if dx * dx + dy * dy <= reach2:
+            if count == near.shape[0]:
+                return False
+            near[count] = i
+            b.near_points[patch, 0, count], b.near_points[patch, 1, count] = points[0, i], points[1, i]
+            count += 1
+    b.near_count[patch] = count
+    return True
+
+
+@njit(**OPTIONS)
+def begin_patch(b: Any, patch: int) -> None:
+    """What a patch needs beside its rows. Its square, nodes and close points are there already.
+
+    Without BLAS: its threads wait for each other, and beside a busy process that takes longer than many steps.
+    """
+    form, nodes, places, U = b.form, b.nodes[patch], b.near_points[patch], b.near_U[patch]
+    c, Q, j = int(form[0]), b.nodes.shape[1], b.near_count[patch]
+    felt, held = np.empty((Q * c, b.table.shape[0])), b.nodes_held[patch]
+    for a in range(Q):
+        one = slice(a * c, (a + 1) * c)
+        felt_at(b, nodes[a, 0], nodes[a, 1], felt[one])
+        held_of(b.L_inverse, felt[one], held[one])
+    for i in range(Q * c):
+        for a in range(Q * c):
+            b.nodes_own[patch, i, a] = smooth_part(felt, i, held, a)
+    contacts_and_nodes(b, patch, 0)
+    b.nodes_newton[patch] = 0.0
+    for a in range(Q):
+        for i in range(j):
+            xx, xy, yy = kernel(form, places[0, i] - nodes[a, 0], places[1, i] - nodes[a, 1])
+            U[a, i] = xx
+            if c == 2:
+                U[Q + a, i], U[2 * Q + a, i] = xy, yy
+    b.built[patch] = 0
+
+
+@njit(**OPTIONS)
+def build_rows(b: Any, patch: int, count: int) -> None:
+    """The next rows of a patch."""
+    form, nodes = b.form, b.nodes[patch]
+    c, n, Q, kc = int(form[0]), b.points.shape[1], nodes.shape[0], b.count[0] * int(form[0])
+    begin = b.built[patch]
+    r = min(Q, begin + count) - begin
+    rc, newton = r * c, np.empty((1, b.MT.shape[1]))
+    minus_held, minus_newton = np.empty((rc, b.table.shape[0])), np.empty((rc, kc))
+    for i in range(rc):
+        newton_of_node(b, patch, begin * c + i, newton)
+        b.nodes_newton[patch, begin * c + i, :kc] = newton[0, :kc]
+        minus_held[i] = -b.nodes_held[patch, begin * c + i]
+        minus_newton[i] = -newton[0, :kc]
+    width = CHUNK // c
+    out = np.empty((rc, c * width))
+    for start in range(0, n, width):
+        w = min(n, start + width) - start
+        source_rows(b, nodes[begin : begin + r], minus_held, minus_newton, start, start + w, out)
+        for i in range(rc):
+            for e in range(c):
+                row = (patch * Q + begin) * c + i
+                keep(b.rows, b.single, row, e * n + start, out[i, e * w : (e + 1) * w])
+    b.built[patch] = begin + r
+
+
+@njit(**OPTIONS)
+def add_near(b: Any, x: float, y: float, sx: float, sy: float, mesh: Any) -> None:
+    """Add what interpolation leaves out of U at the points close to the patch, times (sx, sy)."""
+    p, form, shares = int(b.met[0]), b.form, b.shares[0]
+    Q, near, U, block = shares.shape[0], b.near[p], b.near_U[p], CHUNK // 2
+    rough = b.rough
+    for start in range(0, b.near_count[p], block):
+        stop = min(b.near_count[p], start + block)
+        w = stop - start
+        kernel_rows(form, b.near_points[p], start, stop, x, y, rough, 0)
+        if form[0] == 1.0:
+            one = rough[0, :w]
+            for a in range(Q):
+                share, line = shares[a], U[a, start:stop]
+                for i in range(w):
+                    one[i] -= share * line[i]
+            for i in range(w):
+                m = near[start + i]
+                mesh[m, 0] += one[i] * sx
+                mesh[m, 1] += one[i] * sy
+            continue
+        # kernel_rows has left xx and xy in the first row, yx and yy in the second
+        for a in range(Q):
+            share = shares[a]
+            xx, xy, yy = U[a, start:stop], U[Q + a, start:stop], U[2 * Q + a, start:stop]
+            for i in range(w):
+                rough[0, i] -= share * xx[i]
+                rough[0, w + i] -= share * xy[i]
+                rough[1, w + i] -= share * yy[i]
+        for i in range(w):
+            m = near[start + i]
+            mesh[m, 0] += rough[0, i] * sx + rough[0, w + i] * sy
+            mesh[m, 1] += rough[0, w + i] * sx + rough[1, w + i] * sy
