@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -26,14 +27,13 @@ def pose(i):
 def settled(shape=(30, 24), steps=1200):
     """A model in the middle of a push, its contacts and its patch complete: the next step is a plain one."""
     grid = RegularGrid(shape, (40 / (shape[0] - 1), 30 / (shape[1] - 1)))
-    model, i, before = TPSModel(grid), 0, -1
-    state = model.rest()
-    r = model.fast.response
-    while i < steps or r.statistics.built != before:
-        i += 1
-        before = r.statistics.built
-        state = model.advance(state, pose(i), 1e-3)
-    return model, state, i
+    model = TPSModel(grid)
+    state, i, work = model.rest(), 0, model.fast.response.statistics
+    while True:
+        before, after = replace(work), model.advance(state, pose(i + 1), 1e-3)
+        if i >= steps and work == before:
+            return model, state, i
+        state, i = after, i + 1
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from echospline.mechanics.tip_patch import AHEAD, HALF_WIDTH, LASTS
 from echospline.mechanics.touch import clearance, follow, load, needle, touch
 from echospline.needle import ZERO_LENGTH
 
-CONTACTS, NOT_YET, DONE = 0, 1, 2
+CONTACTS, BEYOND, RELEASED, DONE = 0, 1, 2, 3
 
 SAME_PLACE = 1e-6
 """mm; a tip this close to a contact speaks for it."""
@@ -137,16 +137,24 @@ def move(
 
 
 @njit(**OPTIONS)
-def allowed(table: Any, before: Any, q: Any, free: Any, pose: Any, setting: Any) -> Any:
-    """How far a node may move in this step (mm), and whether a contact that has left can go."""
+def allowed(table: Any, before: Any, pose: Any, setting: Any) -> Any:
+    """How far a node may move in this step, mm; the table has the displacements before it."""
     longest = sqrt(before[3] * before[3] + before[4] * before[4]) if before[0] > 0.0 else 0.0
-    drops = False
     for j in range(table.shape[0]):
         longest = max(longest, sqrt(table[j, 2] * table[j, 2] + table[j, 3] * table[j, 3]))
-        if table[j, 1] == 0.0:
-            dx, dy = q[j, 0] - free[j, 0], q[j, 1] - free[j, 1]
-            drops = drops or sqrt(dx * dx + dy * dy) <= LET_GO
-    return CALM * (pose[8] + longest * -expm1(-setting[4] * pose[9])) + LET_GO, drops
+    return CALM * (pose[8] + longest * -expm1(-setting[4] * pose[9])) + LET_GO
+
+
+@njit(**OPTIONS)
+def released(table: Any, free: Any) -> Any:
+    """Keep the contacts that touch the needle or are not yet at rest in the field without them; how many."""
+    kept = 0
+    for j in range(table.shape[0]):
+        dx, dy = table[j, 2] - free[j, 0], table[j, 3] - free[j, 1]
+        if table[j, 1] > 0.0 or sqrt(dx * dx + dy * dy) > LET_GO:
+            table[kept] = table[j]
+            kept += 1
+    return kept
 
 
 @njit(**OPTIONS)
@@ -171,8 +179,8 @@ def step(
     Returns
     -------
     outcome : int
-        `CONTACTS` have to be added or dropped first (the table says which), or `DONE`, or `NOT_YET`: the field moves
-        beyond the limit, or a contact can go.
+        `CONTACTS` have to be added or dropped first (the table says which); the field moves `BEYOND` the limit;
+        contacts that have left can be `RELEASED` (the table is without them, the mesh not yet); or `DONE`.
     table, tip, mesh
         The new state.
     how : int
@@ -191,8 +199,10 @@ def step(
     tip, on_tip, soft, combined = move(b, places, posts, walls, setting, table, before, pose)
     q = b.q[:k]
     mesh, change, how, tip[11] = spread(b, table, q, tip, on_tip, soft, was, combined)
-    limit, drops = allowed(table, before, q, b.free[:k], pose, setting)
-    if change > limit * limit or drops:
-        return NOT_YET, table, before, was, how, False
+    if change > allowed(table, before, pose, setting) ** 2:
+        return BEYOND, table, before, was, how, False
     table[:, 2:4] = q
+    kept = released(table, b.free)
+    if kept < k:
+        return RELEASED, table[:kept], tip, mesh, how, False
     return DONE, table, tip, mesh, how, lacks_patch(b, tip, before)

@@ -16,8 +16,17 @@ import numpy as np
 from echospline.grid import Floats, RegularGrid
 from echospline.mechanics.anchored_kernel import AnchoredKernel
 from echospline.mechanics.compiled import compile_ahead
-from echospline.mechanics.compiled_step import CONTACTS, NOT_YET, SAME_PLACE, allowed, move, step
-from echospline.mechanics.interaction import LET_GO, largest_share
+from echospline.mechanics.compiled_step import (
+    BEYOND,
+    CONTACTS,
+    RELEASED,
+    SAME_PLACE,
+    allowed,
+    move,
+    released,
+    step,
+)
+from echospline.mechanics.interaction import largest_share
 from echospline.mechanics.kernels import ThinPlate
 from echospline.mechanics.pixel_field import PixelField
 from echospline.mechanics.response import NO_TIP, Precision, Response
@@ -130,8 +139,11 @@ class FusedStep:
                 break
             r.set_contacts(table[:, 0])
         held_back = state.held_back
-        if outcome == NOT_YET:
-            table, tip, mesh, held_back = self._finish(state, pose, dt, place, table)
+        if outcome == BEYOND:
+            table, tip, mesh = self._hold_back(state, pose, dt, place, table)
+            held_back += 1
+        elif outcome == RELEASED:
+            table, tip, mesh = self._without_released(table, tip, state.mesh)
         if how == 2:
             r.statistics.direct += 1
         if lacks:
@@ -139,38 +151,39 @@ class FusedStep:
             r.prepare((tip[1:3] - a.centre) / a.scale, (tip[1:3] - before[1:3]) / a.scale)
         return FusedState(table, tip, mesh, held_back)
 
-    def _finish(
+    def _hold_back(
         self, state: FusedState, pose: NeedlePose, dt: float, place: Floats, table: Floats
-    ) -> tuple[Floats, Floats, Floats, int]:
-        """End a step in which the landmarks are held back or contacts that have left can go, as `tps.TPSModel` does.
-
-        Held back: landmarks move only so far that no node moves beyond the limit, by the field's linearity.
-        """
+    ) -> tuple[Floats, Floats, Floats]:
+        """Move the landmarks only so far that no node moves beyond the limit, by the field's linearity, as
+        `tps.TPSModel` does."""
         s, r = self.setting, self.response
-        before, was, at, held_back, k = state.tip, state.mesh, r.at, state.held_back, len(table)
+        before, was, at, k = state.tip, state.mesh, r.at, len(table)
         numbers = needle(*pose.entry, *pose.tip, pose.speed, dt, bool(s.numbers[8]), before, place)
         tip, on_tip, soft, _ = move(r.basis, s.places, s.posts, s.walls, s.numbers, table, before, numbers)
         q, free = r.q[:k].copy(), r.free[:k].copy()
-        limit, _ = allowed(table, before, q, free, numbers, s.numbers)
-        mesh, change = r.field(table, q, tip, soft, on_tip, was)
-        if change > limit * limit:
-            start, stay = table[:, 2:4].copy(), tip.copy()
-            if tip[0] > 0.0:
-                stay[3:5] = self._value_before(table, before, tip, float(numbers[14]))
-            rest, _ = r.field(table, start, stay, soft, on_tip)
-            share = largest_share(rest[at] - was[at], mesh[at] - was[at], limit)
-            q = start + share * (q - start)
-            tip[3:5] = stay[3:5] + share * (tip[3:5] - stay[3:5])
-            mesh = rest + share * (mesh - rest)
-            held_back += 1
+        limit = allowed(table, before, numbers, s.numbers)
+        mesh, _, _ = r.field(table, q, tip, soft, on_tip)
+        start, stay = table[:, 2:4].copy(), tip.copy()
+        if tip[0] > 0.0:
+            stay[3:5] = self._value_before(table, before, tip, float(numbers[14]))
+        rest, _, _ = r.field(table, start, stay, soft, on_tip)
+        share = largest_share(rest[at] - was[at], mesh[at] - was[at], limit)
+        q = start + share * (q - start)
+        tip[3:5] = stay[3:5] + share * (tip[3:5] - stay[3:5])
+        mesh = rest + share * (mesh - rest)
         table[:, 2:4] = q
-        keep = (table[:, 1] > 0.0) | (np.hypot(*(q - free).T) > LET_GO)
-        if not keep.all():
-            table = table[keep]
-            r.set_contacts(table[:, 0])
-            mesh, _ = r.field(table, table[:, 2:4].copy(), tip, soft, self._on_tip(table, tip))
+        kept = released(table, free)
+        if kept < k:
+            return self._without_released(table[:kept], tip, was)
         tip[11] = np.hypot(*mesh[at].T).max()
-        return table, tip, mesh, held_back
+        return table, tip, mesh
+
+    def _without_released(self, table: Floats, tip: Floats, was: Floats) -> tuple[Floats, Floats, Floats]:
+        """Let go the contacts that a table does not have any more."""
+        self.response.set_contacts(table[:, 0])
+        q, soft, on_tip = table[:, 2:4].copy(), self._soft(tip), self._on_tip(table, tip)
+        mesh, _, tip[11] = self.response.field(table, q, tip, soft, on_tip, was)
+        return table, tip, mesh
 
     def _value_before(self, table: Floats, before: Floats, tip: Floats, soft: float) -> tuple[float, float]:
         """Field at the tip's landmark before the step, mm."""
@@ -194,20 +207,20 @@ class FusedStep:
         with self.lock:
             self.response.set_contacts(state.landmarks[:, 0])
             on_tip = self._on_tip(state.landmarks, state.tip)
-            return field(self.response, state.mesh, state.landmarks, state.tip, self._soft(state), on_tip)
+            return field(self.response, state.mesh, state.landmarks, state.tip, self._soft(state.tip), on_tip)
 
-    def _soft(self, state: FusedState) -> float:
-        """Softness of a state's tip landmark."""
-        if self.setting.tip_softness is None or not state.tip[0]:
+    def _soft(self, tip: Floats) -> float:
+        """Softness of a tip's landmark."""
+        if self.setting.tip_softness is None or not tip[0]:
             return 0.0
-        return self.setting.tip_softness((float(state.tip[1]), float(state.tip[2])))
+        return self.setting.tip_softness((float(tip[1]), float(tip[2])))
 
     def spline(self, state: FusedState) -> Spline | None:
         """Return the field of a state as a spline, in double precision; None where nothing is displaced."""
         if not len(state.landmarks) and not state.tip[0]:
             return None
         with self.lock:
-            soft = self._soft(state)
+            soft = self._soft(state.tip)
             self.response.set_contacts(state.landmarks[:, 0])
             on_tip = self._on_tip(state.landmarks, state.tip)
             return self.response.spline(state.landmarks, state.landmarks[:, 2:4], state.tip, soft, on_tip)

@@ -23,14 +23,14 @@ from echospline.mechanics.contacts import change, misfit
 from echospline.mechanics.mesh_field import SIGN, field, field_before
 from echospline.mechanics.row_sums import BLOCK
 from echospline.mechanics.spline import Spline
-from echospline.mechanics.tip_column import begin_patch, build_rows, meet, points_near
-from echospline.mechanics.tip_patch import AHEAD, COEFFICIENTS, DEGREE, NODES, TipPatch
+from echospline.mechanics.tip_column import meet, tend
+from echospline.mechanics.tip_patch import COEFFICIENTS, DEGREE, NODES
 
 RESIDUAL = 1e-6
 """mm; misfit at the landmarks, for displacements of 1 mm, at which the response is rebuilt."""
 
 CATCH_UP = 3
-"""Rows of a patch that one step builds while the tip has none; otherwise one, so that no step takes long."""
+"""Rows of a patch that one step builds while the tip has none."""
 
 LINE = 64
 """Bytes in a cache line."""
@@ -100,7 +100,6 @@ class Response:
         self.precision = precision
         self.softness = np.zeros(len(scene.sources)) if softness is None else softness
         self.statistics = Statistics()
-        self.patches: list[TipPatch | None] = [None, None]
         c, Q, m, K = scene.components, len(NODES), len(scene.table), len(scene.sources)
         self.watched = np.zeros(len(scene.points) if len(scene.points) < 2 * K else 0, dtype=np.int64)
         if len(self.watched):
@@ -122,7 +121,7 @@ class Response:
         self.nodes_newton: Floats = np.empty((2, Q * c, 0))
         self.close: NDArray[np.int64] = np.empty((2, 0), dtype=np.int64)
         self._near_room(64)
-        self._reserve(32)
+        self._reserve(128)
 
     @property
     def count(self) -> int:
@@ -185,7 +184,6 @@ class Response:
         self.contact_of[:] = -1
         self.squares[:] = 0.0
         self.built[:] = 0
-        self.patches = [None, None]
 
     def _reserve(self, contacts: int) -> None:
         """Have room for that many contacts."""
@@ -206,8 +204,9 @@ class Response:
         self._gather()
 
     def _near_room(self, points: int) -> None:
-        """Have room for that many points close to a patch."""
+        """Have room for that many points close to a patch; what was close to earlier ones is forgotten."""
         c = self.scene.components
+        self.squares[:] = 0.0
         self.near = np.zeros((2, points), dtype=np.int64)
         self.near_count = np.zeros(2, dtype=np.int64)
         self.near_points = np.zeros((2, 2, points))
@@ -235,53 +234,26 @@ class Response:
 
     # --- the tip's patches
 
-    def prepare(self, tip: Floats, motion: Floats, rows: int | None = None) -> None:
+    def prepare(self, tip: Floats, motion: Floats, rows: int = CATCH_UP) -> None:
         """Go on building a patch for where a tip will be soon.
 
         Parameters
         ----------
         tip, motion : ndarray, shape (2,)
             Conditioned; ``motion`` is how far it moves in a step.
-        rows : int, optional
-            How many of its rows to build now.
+        rows : int
+            How many of its rows to build now if the tip has no patch; otherwise one, so that no step takes long.
         """
         if self.precision == "double":
             return
-        x, y = tip + AHEAD * motion
-        ready = self.built == len(NODES)
-        serves = [
-            p is not None and bool(r) and p.holds(*tip) for p, r in zip(self.patches, ready, strict=True)
-        ]
-        holds = [p is not None and p.holds(x, y) for p in self.patches]
-        if (ready & holds).any():
-            return
-        if any(holds):
-            which = holds.index(True)
-        else:
-            which = serves.index(False) if not all(serves) else 0
-            length = float(np.hypot(*motion))
-            heading = motion / length if length > 0 else np.zeros(2)
-            patch = TipPatch.around(np.array([x, y]), heading, self.scene.anchors, self.scene.scale)
-            if patch is None:
-                return
-            self._begin(which, patch)
-        rows = (1 if any(serves) else CATCH_UP) if rows is None else rows
-        before = int(self.built[which])
-        build_rows(self.basis, which, rows)
-        self.statistics.built += int(self.built[which]) - before
-
-    def _begin(self, which: int, patch: TipPatch) -> None:
-        self.patches[which] = patch
-        self.built[which] = 0
-        self.squares[which] = (*patch.centre, patch.half)
-        self.nodes[which] = patch.nodes
-        while not points_near(self.basis, which):
+        where = (float(tip[0]), float(tip[1]), float(motion[0]), float(motion[1]), rows)
+        begun, built = tend(self.basis, *where)
+        while begun < 0:
             self._near_room(2 * self.near.shape[1])
             self._gather()
-            self.squares[1 - which] = 0.0  # what was near the other one is forgotten
-            self.patches[1 - which] = None
-        begin_patch(self.basis, which)
-        self.statistics.patches += 1
+            begun, built = tend(self.basis, *where)
+        self.statistics.patches += begun
+        self.statistics.built += built
 
     # --- the field
 
@@ -293,7 +265,7 @@ class Response:
         soft: float = 0.0,
         on_tip: int = -1,
         was: Floats = NOT_ASKED,
-    ) -> tuple[Floats, float]:
+    ) -> tuple[Floats, float, float]:
         """Displacement of all points.
 
         Parameters
@@ -317,10 +289,12 @@ class Response:
             mm.
         change : float
             Square of the largest change at the sources since the earlier field, mm^2; 0 when not asked.
+        reach : float
+            Largest displacement at the sources, mm; 0 when not asked for the change.
         """
-        mesh, moved, how, _ = field(self.basis, table, q, tip, on_tip, soft, was)
+        mesh, moved, how, reach = field(self.basis, table, q, tip, on_tip, soft, was)
         self.statistics.direct += how == 2
-        return mesh, moved
+        return mesh, moved, reach
 
     def before(
         self, table: Floats, q: Floats, tip: Floats, soft: float, point: Floats

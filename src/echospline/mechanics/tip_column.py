@@ -5,6 +5,7 @@ Two patches, so that the next one is ready before the tip leaves the one that it
 
 from __future__ import annotations
 
+from math import inf, sqrt
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from echospline.mechanics.contacts import (
     times_M,
 )
 from echospline.mechanics.row_sums import BLOCK, sum_block
-from echospline.mechanics.tip_patch import DEGREE, NEAR
+from echospline.mechanics.tip_patch import AHEAD, DEGREE, HALF_WIDTH, NEAR, NODES, SMALLEST
 
 STALE = 5.0
 """How many times what is left of a tip contacts may carry of it before they are taken out of its patch's rows."""
@@ -216,25 +217,38 @@ def tip_row(b: Any, x: float, y: float) -> None:
 
 
 @njit(**OPTIONS)
-def points_near(b: Any, patch: int) -> Any:
-    """List the points close to a patch; False where there is no room for them all."""
-    square, points, near = b.squares[patch], b.points, b.near[patch]
-    count, reach2 = 0, (NEAR * square[2]) ** 2
+def place_patch(b: Any, patch: int, x: float, y: float, ahead_x: float, ahead_y: float) -> Any:
+    """Lay a patch around (x, y), with room ahead. -1 where anchors are too close for one, 0 where there is no room to list
+    all points close to it, otherwise 1."""
+    square, points, near, anchors = b.squares[patch], b.points, b.near[patch], b.anchors
+    b.built[patch] = 0
+    square[2], nearest2 = 0.0, inf
+    for i in range(anchors.shape[0]):
+        dx, dy = anchors[i, 0] - x, anchors[i, 1] - y
+        nearest2 = min(nearest2, dx * dx + dy * dy)
+    half = min(HALF_WIDTH / b.frame[2], sqrt(nearest2) / (NEAR + 1.0))
+    if half * b.frame[2] < SMALLEST:
+        return -1
+    cx, cy, count = x + 0.7 * half * ahead_x, y + 0.7 * half * ahead_y, 0
     for i in range(points.shape[1]):
-        dx, dy = points[0, i] - square[0], points[1, i] - square[1]
-        if dx * dx + dy * dy <= reach2:
+        dx, dy = points[0, i] - cx, points[1, i] - cy
+        if dx * dx + dy * dy <= (NEAR * half) ** 2:
             if count == near.shape[0]:
-                return False
+                return 0
             near[count] = i
             b.near_points[patch, 0, count], b.near_points[patch, 1, count] = points[0, i], points[1, i]
             count += 1
     b.near_count[patch] = count
-    return True
+    square[0], square[1], square[2] = cx, cy, half
+    for a in range(b.nodes.shape[1]):
+        b.nodes[patch, a, 0] = cx + half * NODES[a, 0]
+        b.nodes[patch, a, 1] = cy + half * NODES[a, 1]
+    return 1
 
 
 @njit(**OPTIONS)
 def begin_patch(b: Any, patch: int) -> None:
-    """What a patch needs beside its rows. Its square, nodes and close points are there already.
+    """What a patch that has been placed needs beside its rows.
 
     Without BLAS: its threads wait for each other, and beside a busy process that takes longer than many steps.
     """
@@ -256,7 +270,6 @@ def begin_patch(b: Any, patch: int) -> None:
             U[a, i] = xx
             if c == 2:
                 U[Q + a, i], U[2 * Q + a, i] = xy, yy
-    b.built[patch] = 0
 
 
 @njit(**OPTIONS)
@@ -283,6 +296,41 @@ def build_rows(b: Any, patch: int, count: int) -> None:
                 row = (patch * Q + begin) * c + i
                 keep(b.rows, b.single, row, e * n + start, out[i, e * w : (e + 1) * w])
     b.built[patch] = begin + r
+
+
+@njit(**OPTIONS)
+def tend(b: Any, x: float, y: float, dx: float, dy: float, rows: int) -> Any:
+    """Go on with a patch for where a tip at (x, y) that moves by (dx, dy) a step will be soon: begin one, or build the next
+    of its rows (``rows`` of them while the tip has no patch).
+
+    Returns
+    -------
+    begun, built : int
+        Patches and rows; -1 and 0 where there is no room to list the points close to a new one.
+    """
+    ahead_x, ahead_y, Q = x + AHEAD * dx, y + AHEAD * dy, b.nodes.shape[1]
+    if patch_at(b, ahead_x, ahead_y) >= 0:
+        return 0, 0
+    serves, which = patch_at(b, x, y), -1
+    for p in range(2):
+        square = b.squares[p]
+        inside = abs(ahead_x - square[0]) <= square[2] and abs(ahead_y - square[1]) <= square[2]
+        if square[2] > 0.0 and b.built[p] < Q and inside:
+            which = p
+    begun = 0
+    if which < 0:
+        length = max(sqrt(dx * dx + dy * dy), 1e-300)
+        which = 1 if serves == 0 else 0
+        placed = place_patch(b, which, ahead_x, ahead_y, dx / length, dy / length)
+        if placed <= 0:
+            return (-1 if placed == 0 else 0), 0
+        begin_patch(b, which)
+        begun = 1
+        if serves >= 0:
+            return begun, 0
+    before = b.built[which]
+    build_rows(b, which, 1 if serves >= 0 else rows)
+    return begun, b.built[which] - before
 
 
 @njit(**OPTIONS)

@@ -9,9 +9,6 @@ near, and so nothing cancels in single precision.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
-
 import numpy as np
 
 from echospline.grid import Floats
@@ -65,46 +62,3 @@ AHEAD = len(NODES) + 2
 
 LASTS = 6
 """Steps that a tip needs at least for half a width: a faster one costs less without patches, one row a step."""
-
-
-@dataclass(frozen=True)
-class TipPatch:
-    """A square around a centre, in conditioned coordinates.
-
-    Parameters
-    ----------
-    centre : (x, y)
-    half : float
-        Half the side.
-    """
-
-    centre: tuple[float, float]
-    half: float
-
-    def holds(self, x: float, y: float) -> bool:
-        """Whether a tip position lies inside."""
-        return abs(x - self.centre[0]) <= self.half and abs(y - self.centre[1]) <= self.half
-
-    @cached_property
-    def nodes(self) -> Floats:
-        """Interpolation points, shape (21, 2)."""
-        nodes: Floats = self.half * NODES + self.centre
-        return nodes
-
-    @property
-    def near(self) -> float:
-        """Radius within which the kernel is not taken as smooth."""
-        return NEAR * self.half
-
-    @classmethod
-    def around(cls, tip: Floats, ahead: Floats, anchors: Floats, scale: float) -> TipPatch | None:
-        """Return a patch that holds the tip and leaves it room ahead; None where anchors are too close for one.
-
-        All conditioned; ``scale`` is the length that 1 stands for, mm.
-        """
-        held = float(np.hypot(*(anchors - tip).T).min())
-        half = min(HALF_WIDTH / scale, held / (NEAR + 1.0))
-        if half * scale < SMALLEST:
-            return None
-        x, y = tip + 0.7 * half * ahead
-        return cls((float(x), float(y)), half)
