@@ -45,7 +45,7 @@ def profile(shape):
     q = np.ascontiguousarray(table[:, 2:4])
     x, y = (np.array(pose.tip) - r.scene.centre) / r.scene.scale
     which, alongs, none = np.empty(len(r.at), dtype=np.int64), np.empty(len(r.at)), np.empty((0, 2))
-    tip_column.meet(b, x, y, True)
+    tip_column.meet(b, x, y)
     print(
         f"{model.grid.size} nodes, {k} contacts, {len(model.anchors)} anchors, {len(model.lattice)} possible contacts, "
         f"{r.near_count.max()} nodes near the tip"
@@ -67,14 +67,14 @@ def profile(shape):
         ),
     )
     timed("friction and relaxation", lambda: touch.load(s.places, table, needle, s.numbers, q))
-    timed("the tip against anchors and contacts", lambda: tip_column.meet(b, x, y, True))
-    timed("the same without a patch", lambda: tip_column.meet(b, x, y, False))
-    tip_column.meet(b, x, y, True)
-    timed("weights of the contacts", lambda: mesh_field.combine(b, table, q, tip, -1))
-    timed("all of the field", lambda: mesh_field.spread(b, table, q, tip, -1, 0.0, state.mesh, True))
+    timed("the tip against anchors and contacts", lambda: tip_column.meet(b, x, y))
+    timed("the same without a patch", lambda: tip_column.meet_exactly(b, x, y))
+    tip_column.meet(b, x, y)
+    timed("weights of the contacts", lambda: mesh_field.combine(b, table, q))
+    timed("all of the field", lambda: mesh_field.spread(b, k, tip, -1, 0.0, state.mesh))
     timed(
         "  without looking for the largest change",
-        lambda: mesh_field.spread(b, table, q, tip, -1, 0.0, none, True),
+        lambda: mesh_field.spread(b, k, tip, -1, 0.0, none),
     )
     timed(
         "all of it, one compiled call",

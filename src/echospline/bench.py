@@ -14,6 +14,7 @@ from echospline.grid import Floats, RegularGrid
 from echospline.image import UltrasoundImage
 from echospline.mechanics.fused import FusedStep
 from echospline.mechanics.kernels import Elastic, Kernel, ThinPlate
+from echospline.mechanics.response import Statistics
 from echospline.mechanics.tps import TPSModel, TPSParameters
 from echospline.needle import NeedlePose
 from echospline.warp import warp
@@ -79,7 +80,8 @@ def time_steps(
     -------
     milliseconds : ndarray, shape (k,)
     kinds : list of str, length k
-        "plain", "contacts change" or "patch": a step that evaluates the tip directly and builds its next patch.
+        "contacts change"; "patch": none changes, but the tip's next patch is begun or a row of it built, or the tip's
+        row evaluated; or "plain".
     landmarks : int
         Moving landmarks after the last step.
     """
@@ -88,7 +90,7 @@ def time_steps(
     statistics = model.fast.response.statistics
     state, times, kinds = model.rest(), [], []
     for pose in poses:
-        changes, direct = statistics.joined + statistics.left, statistics.direct
+        changes, before = statistics.joined + statistics.left, _work(statistics)
         begin = perf_counter()
         state = model.advance(state, pose, period)
         model.displacement(state)
@@ -96,8 +98,13 @@ def time_steps(
         if statistics.joined + statistics.left > changes:
             kinds.append("contacts change")
         else:
-            kinds.append("patch" if statistics.direct > direct else "plain")
+            kinds.append("patch" if _work(statistics) > before else "plain")
     return 1000.0 * np.array(times), kinds, model.fast.response.count + 1
+
+
+def _work(statistics: Statistics) -> int:
+    """How much has been done for the tip's column so far."""
+    return statistics.patches + statistics.built + statistics.direct
 
 
 def bare_product(step: FusedStep, repeats: int = 400) -> float:
@@ -140,7 +147,7 @@ def _steps(name: str, shape: tuple[int, int], kernel: Kernel) -> list[Row]:
     late = np.arange(len(times)) > len(times) * 3 // 4  # nearly all contacts are there
     kind = np.array(kinds)
     parts = {
-        f"{name}step": late & (kind == "plain"),
+        f"{name}step": late & (kind != "contacts change"),
         f"{name}contact change": late & (kind == "contacts change"),
         f"{name}all steps": late,
     }

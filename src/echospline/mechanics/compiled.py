@@ -232,7 +232,7 @@ def compile_ahead(
             return 0.0
         say = log.warning if report is None else report
         timer = threading.Timer(
-            3.0, say, args=("compiling the fast step for this machine, once: half a minute or less",)
+            3.0, say, args=("compiling the fast step for this machine, once: a minute or less",)
         )
         timer.daemon = True
         begin = time.perf_counter()

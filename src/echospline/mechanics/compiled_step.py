@@ -14,7 +14,7 @@ from numba import njit
 
 from echospline.mechanics.compiled import OPTIONS
 from echospline.mechanics.interaction import CALM, LET_GO
-from echospline.mechanics.mesh_field import combine, contacts_field, leaving, spread
+from echospline.mechanics.mesh_field import combine, contacts_field, leaving, spoken_for, spread
 from echospline.mechanics.tip_column import meet, patch_at
 from echospline.mechanics.tip_patch import AHEAD, HALF_WIDTH, LASTS
 from echospline.mechanics.touch import clearance, follow, load, needle, touch
@@ -59,12 +59,26 @@ def tip_kind(places: Any, table: Any, before: Any, pose: Any, setting: Any, clea
 
 
 @njit(**OPTIONS)
+def spoken(places: Any, table: Any, tip: Any) -> Any:
+    """The contact for which the tip's landmark speaks, or -1."""
+    found = -1
+    if tip[0] > 0.0:
+        for j in range(table.shape[0]):
+            i = int(table[j, 0])
+            dx, dy = places[0, i] - tip[1], places[1, i] - tip[2]
+            if dx * dx + dy * dy <= SAME_PLACE * SAME_PLACE:
+                found = j
+    return found
+
+
+@njit(**OPTIONS)
 def move(
     b: Any, places: Any, posts: Any, walls: Any, setting: Any, table: Any, before: Any, pose: Any
 ) -> Any:
     """New displacements of contacts (``q``) and tip; ``before`` is the old tip.
 
-    Fills ``q`` and ``free``, the field without the contacts that have left, at those, mm; meets the tip's landmark.
+    Fills ``q`` and ``free``, the field without the contacts that have left, at those, mm; meets the tip's landmark and combines
+    the contacts for `spread`.
 
     Returns
     -------
@@ -73,8 +87,6 @@ def move(
         The contact for which the tip speaks, or -1.
     soft : float
         Softness of the tip's landmark.
-    combined : bool
-        Whether w is that of the new displacements.
     """
     c, k = int(b.form[0]), table.shape[0]
     q, free, tip = b.q[:k], b.free[:k], np.zeros(12)
@@ -89,7 +101,7 @@ def move(
     if kind == LEFT:
         x, y, soft = before[1], before[2], pose[14]
     if kind != NONE:
-        meet(b, (x - b.frame[0]) / b.frame[2], (y - b.frame[1]) / b.frame[2], True)
+        meet(b, (x - b.frame[0]) / b.frame[2], (y - b.frame[1]) / b.frame[2])
     if kind == GIVEN:
         tip[0], tip[1], tip[2], tip[5] = 1.0, x, y, 1.0
         tip[3], tip[4] = pose[2] + push * ax - x, pose[3] + push * ay - y
@@ -97,9 +109,9 @@ def move(
         if before[0] > 0.0:
             wx, wy = before[3], before[4]
         else:
-            combine(b, table, table[:, 2:4], tip, -1)
+            combine(b, table, table[:, 2:4].copy())
             wx, wy = contacts_field(b.t, b.w, k * c, c)
-        combine(b, table, q, tip, -1)
+        combine(b, table, q)
         fx, fy = contacts_field(b.t, b.w, k * c, c)
         inline, ahead = fx * ax + fy * ay, push
         if speed <= 0.0:  # (17): at rest the whole field relaxes, the tip's push with the contacts
@@ -109,31 +121,29 @@ def move(
         tip[0], tip[1], tip[2], tip[5] = 1.0, x, y, 1.0
         tip[3], tip[4] = follow(wx, wy, ahead * ax + fx - inline * ax, ahead * ay + fy - inline * ay, travel)
     elif kind == LEFT:
-        combine(b, table, q, tip, -1)
+        combine(b, table, q)
         fx, fy = contacts_field(b.t, b.w, k * c, c)
         gx, gy = before[3] - fx, before[4] - fy
         if sqrt(gx * gx + gy * gy) > LET_GO:
             tip[0], tip[1], tip[2], tip[5] = 1.0, x, y, 0.0
             tip[3], tip[4] = follow(fx + gx * kept, fy + gy * kept, fx, fy, travel)
-    on_tip, off = -1, 0
+    on_tip = spoken(places, table, tip)
+    given = q if on_tip < 0 else spoken_for(q, tip, on_tip)
+    left = 0
     for j in range(k):
-        off += table[j, 1] == 0.0
-        i = int(table[j, 0])
-        dx, dy = places[0, i] - x, places[1, i] - y
-        if tip[0] > 0.0 and sqrt(dx * dx + dy * dy) <= SAME_PLACE:
-            on_tip = j
-    free[:, :] = 0.0
-    if off > 0:
-        given = q.copy()
-        if on_tip >= 0:
-            given[on_tip, 0], given[on_tip, 1] = tip[3], tip[4]
+        left += table[j, 1] == 0.0
+    if left > 0:
+        free[:, :] = 0.0
         leaving(b, table, given, on_tip, soft, tip, free)
         for j in range(k):
             if table[j, 1] == 0.0:
                 fx, fy = free[j, 0], free[j, 1]
                 gx, gy = table[j, 2] - fx, table[j, 3] - fy
                 q[j, 0], q[j, 1] = follow(fx + gx * kept, fy + gy * kept, fx, fy, travel)
-    return tip, on_tip, soft, kind >= FOLLOWS and off == 0 and on_tip < 0
+        given = q if on_tip < 0 else spoken_for(q, tip, on_tip)
+    if left > 0 or on_tip >= 0 or kind < FOLLOWS:
+        combine(b, table, given)
+    return tip, on_tip, soft
 
 
 @njit(**OPTIONS)
@@ -196,12 +206,11 @@ def step(
         same = same and b.contact_of[int(table[j, 0])] >= 0
     if not same:
         return CONTACTS, table, before, was, 0, False
-    tip, on_tip, soft, combined = move(b, places, posts, walls, setting, table, before, pose)
-    q = b.q[:k]
-    mesh, change, how, tip[11] = spread(b, table, q, tip, on_tip, soft, was, combined)
+    tip, on_tip, soft = move(b, places, posts, walls, setting, table, before, pose)
+    mesh, change, how, tip[11] = spread(b, k, tip, on_tip, soft, was)
     if change > allowed(table, before, pose, setting) ** 2:
         return BEYOND, table, before, was, how, False
-    table[:, 2:4] = q
+    table[:, 2:4] = b.q[:k]
     kept = released(table, b.free)
     if kept < k:
         return RELEASED, table[:kept], tip, mesh, how, False

@@ -20,10 +20,10 @@ from echospline.mechanics.compiled_step import (
     BEYOND,
     CONTACTS,
     RELEASED,
-    SAME_PLACE,
     allowed,
     move,
     released,
+    spoken,
     step,
 )
 from echospline.mechanics.interaction import largest_share
@@ -159,7 +159,7 @@ class FusedStep:
         s, r = self.setting, self.response
         before, was, at, k = state.tip, state.mesh, r.at, len(table)
         numbers = needle(*pose.entry, *pose.tip, pose.speed, dt, bool(s.numbers[8]), before, place)
-        tip, on_tip, soft, _ = move(r.basis, s.places, s.posts, s.walls, s.numbers, table, before, numbers)
+        tip, on_tip, soft = move(r.basis, s.places, s.posts, s.walls, s.numbers, table, before, numbers)
         q, free = r.q[:k].copy(), r.free[:k].copy()
         limit = allowed(table, before, numbers, s.numbers)
         mesh, _, _ = r.field(table, q, tip, soft, on_tip)
@@ -188,19 +188,14 @@ class FusedStep:
     def _value_before(self, table: Floats, before: Floats, tip: Floats, soft: float) -> tuple[float, float]:
         """Field at the tip's landmark before the step, mm."""
         q = table[:, 2:4].copy()
-        spoken = self._on_tip(table, before)
-        if spoken >= 0:
-            q[spoken], before = before[3:5], NO_TIP
+        on_tip = self._on_tip(table, before)
+        if on_tip >= 0:
+            q[on_tip], before = before[3:5], NO_TIP
         return self.response.before(table, q, before, soft, tip[1:3])
 
     def _on_tip(self, table: Floats, tip: Floats) -> int:
         """Contact for which a tip's landmark speaks, or -1."""
-        if tip[0] == 0.0 or not len(table):
-            return -1
-        places = self.setting.places[:, table[:, 0].astype(np.int64)]
-        distance = np.hypot(places[0] - tip[1], places[1] - tip[2])
-        nearest = int(distance.argmin())
-        return nearest if distance[nearest] <= SAME_PLACE else -1
+        return int(spoken(self.setting.places, table, tip))
 
     def fine(self, state: FusedState, field: PixelField) -> Floats:
         """Displacement of a fine mesh, shape (n, 2) mm."""

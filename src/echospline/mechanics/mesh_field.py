@@ -11,7 +11,15 @@ from numba import njit
 from echospline.mechanics.compiled import OPTIONS, bits, kernel, number
 from echospline.mechanics.contacts import cholesky, cholesky_solve, smooth_part, times_M
 from echospline.mechanics.row_sums import BLOCK, sum_block, sum_block_twice
-from echospline.mechanics.tip_column import add_near, combine_nodes, meet, tip_row
+from echospline.mechanics.tip_column import (
+    add_near,
+    combine_nodes,
+    meet,
+    meet_exactly,
+    renew,
+    stale,
+    tip_row,
+)
 
 SIGN = 0x7FFFFFFFFFFFFFFF
 """All bits of a double but its sign: as integers, the numbers that they leave have the order of their sizes, and the
@@ -19,13 +27,11 @@ largest is found eight at a time; NaN is above all."""
 
 
 @njit(**OPTIONS)
-def combine(b: Any, table: Any, q: Any, tip: Any, on_tip: int) -> None:
-    """w = M d for the displacements q (k, 2) of the contacts in a table, that are all there; the tip speaks for one."""
+def combine(b: Any, table: Any, q: Any) -> None:
+    """w = M d for the displacements q (k, 2) of the contacts in a table, that are all there."""
     c, d, contact_of = int(b.form[0]), b.d, b.contact_of
     for j in range(q.shape[0]):
         i, x, y = contact_of[int(table[j, 0])], q[j, 0], q[j, 1]
-        if j == on_tip:
-            x, y = tip[3], tip[4]
         if c == 1:
             d[0, i], d[1, i] = x, y
         else:
@@ -104,7 +110,7 @@ def leaving(b: Any, table: Any, q: Any, on_tip: int, soft: float, tip: Any, free
             F[count] = j
             given[j, 0] = given[j, 1] = 0.0
             count += 1
-    combine(b, table, given, tip, -1)
+    combine(b, table, given)
     fc, w, t = count * c, b.w, b.t
     rows, A, u = np.empty((fc, kc)), np.empty((fc, fc)), np.zeros((fc, rhs + c))
     for x in range(fc):
@@ -154,10 +160,8 @@ def leaving(b: Any, table: Any, q: Any, on_tip: int, soft: float, tip: Any, free
 
 
 @njit(**OPTIONS)
-def spread(
-    b: Any, table: Any, q: Any, tip: Any, on_tip: int, soft: float, was: Any, combined: bool
-) -> Any:  # fmt: skip
-    """Field of contacts q (k, 2) and tip on the whole mesh. `meet` has met the tip's landmark; ``combined``: w is there.
+def spread(b: Any, k: int, tip: Any, on_tip: int, soft: float, was: Any) -> Any:
+    """Field of k contacts and tip on the whole mesh. `meet` has met the tip's landmark, and `combine` the contacts.
 
     A tip inside a patch is interpolated there; another one has its row evaluated.
 
@@ -172,11 +176,9 @@ def spread(
     reach : float
         Largest displacement at those nodes, mm.
     """
-    weights, offsets, w, t, n, k = b.weights, b.offsets, b.w, b.t, b.points.shape[1], q.shape[0]
+    weights, offsets, w, t, n = b.weights, b.offsets, b.w, b.t, b.points.shape[1]
     c, kc, width = int(b.form[0]), k * int(b.form[0]), b.product.shape[1]
     head, Qc = b.product.shape[0] - b.MT.shape[0], b.nodes.shape[1] * c
-    if not combined:
-        combine(b, table, q, tip, on_tip)
     for i in range(kc):
         offsets[i], weights[0, i] = (head + i) * width, w[0, i]
         if c == 1:
@@ -189,6 +191,9 @@ def spread(
         patch = int(b.met[0])
         if patch >= 0:
             how, count = 1, kc + Qc
+            first = stale(b, patch)
+            if first >= 0:
+                renew(b, patch, first)
             interpolate(b, patch, sx, sy, kc)
             for a in range(Qc):
                 offsets[kc + a] = (patch * Qc + a) * width
@@ -245,11 +250,20 @@ def largest(at: Any, watched: Any, mesh: Any, was: Any) -> Any:
 
 
 @njit(**OPTIONS)
+def spoken_for(q: Any, tip: Any, on_tip: int) -> Any:
+    """Displacements of the contacts, the tip's own for the one that it speaks for."""
+    given = q.copy()
+    given[on_tip, 0], given[on_tip, 1] = tip[3], tip[4]
+    return given
+
+
+@njit(**OPTIONS)
 def field(b: Any, table: Any, q: Any, tip: Any, on_tip: int, soft: float, was: Any) -> Any:
-    """`spread` of a tip that has not been met yet."""
+    """`spread` of landmarks that have not been met and combined yet."""
+    combine(b, table, q if on_tip < 0 else spoken_for(q, tip, on_tip))
     if tip[0] > 0.0:
-        meet(b, (tip[1] - b.frame[0]) / b.frame[2], (tip[2] - b.frame[1]) / b.frame[2], True)
-    return spread(b, table, q, tip, on_tip, soft, was, False)
+        meet(b, (tip[1] - b.frame[0]) / b.frame[2], (tip[2] - b.frame[1]) / b.frame[2])
+    return spread(b, table.shape[0], tip, on_tip, soft, was)
 
 
 @njit(**OPTIONS)
@@ -257,14 +271,14 @@ def field_before(b: Any, table: Any, q: Any, before: Any, soft: float, x: float,
     """Field at (x, y) mm of contacts q and the old tip ``before`` (absent: of the contacts alone)."""
     c, kc = int(b.form[0]), table.shape[0] * int(b.form[0])
     px, py = (x - b.frame[0]) / b.frame[2], (y - b.frame[1]) / b.frame[2]
-    combine(b, table, q, before, -1)
-    meet(b, px, py, False)
+    combine(b, table, q)
+    meet_exactly(b, px, py)
     vx, vy = contacts_field(b.t, b.w, kc, c)
     if before[0] == 0.0:
         return vx, vy
     here, felt = b.t[:, :kc].copy(), b.tip_felt.copy()
     bx, by = (before[1] - b.frame[0]) / b.frame[2], (before[2] - b.frame[1]) / b.frame[2]
-    meet(b, bx, by, False)
+    meet_exactly(b, bx, by)
     gx, gy = contacts_field(b.t, b.w, kc, c)
     sx, sy = tip_weights(b.met[1:4], soft, before[3] - gx, before[4] - gy, c)
     e = np.empty((c, c))

@@ -23,7 +23,7 @@ from echospline.mechanics.contacts import change, misfit
 from echospline.mechanics.mesh_field import SIGN, field, field_before
 from echospline.mechanics.row_sums import BLOCK
 from echospline.mechanics.spline import Spline
-from echospline.mechanics.tip_column import meet, tend
+from echospline.mechanics.tip_column import meet_exactly, tend
 from echospline.mechanics.tip_patch import COEFFICIENTS, DEGREE, NODES
 
 RESIDUAL = 1e-6
@@ -323,7 +323,7 @@ class Response:
         coupling = s.held[(c * sources[:, None] + np.arange(c)).ravel()].T
         if tip[0] > 0 and on_tip < 0:
             place = (tip[1:3] - s.centre) / s.scale
-            meet(self.basis, float(place[0]), float(place[1]), False)
+            meet_exactly(self.basis, float(place[0]), float(place[1]))
             t, own = self.t[:c, :n], self.met[1:2] if c == 1 else self.met[[1, 2, 2, 3]]
             gap = tip[3:5].reshape(c, 2 // c) - t @ w
             s_tip = np.linalg.solve(own.reshape(c, c) + soft * np.eye(c), gap)

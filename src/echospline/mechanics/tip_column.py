@@ -130,74 +130,104 @@ def renew(b: Any, patch: int, first: int) -> None:
 
 
 @njit(**OPTIONS)
-def meet(b: Any, x: float, y: float, patched: bool) -> None:
-    """What a point has to do with the landmarks, in double precision: fills ``met``, ``cross``, ``t``, and ``shares`` where
-    a patch (``patched``: may be used) holds it, otherwise ``tip_felt`` and ``tip_held``."""
-    form, sources, source_of, cross, met, t = b.form, b.sources, b.source_of, b.cross, b.met, b.t
-    c, k = int(form[0]), b.count[0]
-    p = patch_at(b, x, y) if patched else -1
-    met[0] = p
-    own = b.own
+def meet_in_patch(b: Any, p: int, x: float, y: float) -> None:
+    """G of a point inside a patch with the contacts (``cross``), and its own without U (``own``), from those of the nodes."""
+    form, sources, cross, shares, G, own = b.form, b.sources, b.cross, b.shares[0], b.nodes_own[p], b.own
+    c, Q = int(form[0]), shares.shape[0]
+    shares_at(b.squares[p], x, y, b.coefficients, b.polynomials, shares)
+    for a in range(c):
+        combine_nodes(b, b.nodes_contacts[p, a:], cross[a:])
+    for j in range(b.count[0]):
+        if b.close[p, j] == 0:
+            continue
+        s = b.source_of[j]
+        xx, xy, yy = kernel(form, x - sources[s, 0], y - sources[s, 1])
+        cross[0, j * c] += xx
+        if c == 2:
+            cross[0, 2 * j + 1] += xy
+            cross[1, 2 * j] += xy
+            cross[1, 2 * j + 1] += yy
     own[:, :] = 0.0
-    if p >= 0:
-        shares, Q = b.shares[0], b.shares.shape[1]
-        shares_at(b.squares[p], x, y, b.coefficients, b.polynomials, shares)
-        G = b.nodes_own[p]
+    for i in range(Q):
         for a in range(c):
-            combine_nodes(b, b.nodes_contacts[p, a:], cross[a:])
-        for j in range(k):
-            if b.close[p, j] == 0:
-                continue
-            s = source_of[j]
-            xx, xy, yy = kernel(form, x - sources[s, 0], y - sources[s, 1])
-            cross[0, j * c] += xx
-            if c == 2:
-                cross[0, 2 * j + 1] += xy
-                cross[1, 2 * j] += xy
-                cross[1, 2 * j + 1] += yy
-        for i in range(Q):
-            for a in range(c):
-                line = G[i * c + a]
-                for e in range(c):
-                    value = 0.0
-                    for q in range(Q):
-                        value += shares[q] * line[q * c + e]
-                    own[a, e] += shares[i] * value
-    else:
-        felt, held = b.tip_felt, b.tip_held
-        felt_at(b, x, y, felt)
-        held_of(b.L_inverse, felt, held)
-        for j in range(k):
-            s = source_of[j]
-            xx, xy, yy = kernel(form, x - sources[s, 0], y - sources[s, 1])
-            for a in range(c):
-                for e in range(c):
-                    value = xx if a + e == 0 else (yy if a + e == 2 else xy)
-                    cross[a, j * c + e] = value + smooth_part(b.felt, s * c + e, held, a)
+            line = G[i * c + a]
+            for e in range(c):
+                value = 0.0
+                for q in range(Q):
+                    value += shares[q] * line[q * c + e]
+                own[a, e] += shares[i] * value
+
+
+@njit(**OPTIONS)
+def meet_anchors(b: Any, x: float, y: float) -> None:
+    """The same for any point, from the anchors; also fills ``tip_felt`` and ``tip_held``."""
+    form, sources, cross, felt, held, own = b.form, b.sources, b.cross, b.tip_felt, b.tip_held, b.own
+    c = int(form[0])
+    felt_at(b, x, y, felt)
+    held_of(b.L_inverse, felt, held)
+    for j in range(b.count[0]):
+        s = b.source_of[j]
+        xx, xy, yy = kernel(form, x - sources[s, 0], y - sources[s, 1])
         for a in range(c):
             for e in range(c):
-                own[a, e] = smooth_part(felt, a, held, e)
+                value = xx if a + e == 0 else (yy if a + e == 2 else xy)
+                cross[a, j * c + e] = value + smooth_part(b.felt, s * c + e, held, a)
     for a in range(c):
-        times_M(b, cross[a:], t[a:])
-    xx, xy, yy = kernel(form, 0.0, 0.0)
+        for e in range(c):
+            own[a, e] = smooth_part(felt, a, held, e)
+
+
+@njit(**OPTIONS)
+def settle(b: Any, p: int) -> None:
+    """From what a point has to do with each landmark to what is left of it: ``t`` and ``met``."""
+    own, t, met, kc = b.own, b.t, b.met, b.count[0] * int(b.form[0])
+    c = own.shape[0]
+    for a in range(c):
+        times_M(b, b.cross[a:], t[a:])
+    xx, _, _ = kernel(b.form, 0.0, 0.0)
     for a in range(c):
         own[a, a] += xx
         for e in range(c):
-            for i in range(k * c):
+            for i in range(kc):
                 own[a, e] -= t[a, i] * t[e, i]
-    met[1] = own[0, 0]
+    met[0], met[1] = p, own[0, 0]
     if c == 2:
         met[2], met[3] = 0.5 * (own[0, 1] + own[1, 0]), own[1, 1]
+
+
+@njit(**OPTIONS)
+def meet(b: Any, x: float, y: float) -> None:
+    """What a point has to do with the landmarks, in double precision: fills ``met`` and ``t``, and ``shares`` where a patch
+    holds it, otherwise ``tip_felt`` and ``tip_held``."""
+    p = patch_at(b, x, y)
     if p >= 0:
-        # contacts that joined since the patch was built: its rows still hold what those carry by now. Once that is most of
-        # them, what is left of the tip would be the difference of large numbers in single precision
-        first, joined = k * c, 0.0
-        while first > 0 and b.nodes_newton[p, 0, first - 1] == 0.0:
-            first -= 1
-            for a in range(c):
-                joined += t[a, first] * t[a, first]
-        if joined > STALE * (met[1] + met[3]):
-            renew(b, p, first)
+        meet_in_patch(b, p, x, y)
+    else:
+        meet_anchors(b, x, y)
+    settle(b, p)
+
+
+@njit(**OPTIONS)
+def meet_exactly(b: Any, x: float, y: float) -> None:
+    """`meet` without a patch."""
+    meet_anchors(b, x, y)
+    settle(b, -1)
+
+
+@njit(**OPTIONS)
+def stale(b: Any, p: int) -> Any:
+    """First of the contacts (flat) that joined since a patch was built and have to be taken out of its rows, or -1.
+
+    The rows still hold what those contacts carry by now. Once that is most of them, what is left of the tip would be the
+    difference of large numbers in single precision.
+    """
+    c, t, met = int(b.form[0]), b.t, b.met
+    first, joined = b.count[0] * c, 0.0
+    while first > 0 and b.nodes_newton[p, 0, first - 1] == 0.0:
+        first -= 1
+        for a in range(c):
+            joined += t[a, first] * t[a, first]
+    return first if joined > STALE * (met[1] + met[3]) else -1
 
 
 @njit(**OPTIONS)
