@@ -44,7 +44,7 @@ FIELDS = {
     "product": "rows or single: what is multiplied",
     # the tip's patches, two of each (`tip_column`)
     "squares": "(2, 3) centre and half side; half 0: none",
-    "built": "(2,) how many of its Q rows a patch has",
+    "built": "(2,) at how many points the rows of a patch are there",
     "nodes": "(2, Q, 2) interpolation points",
     "nodes_held": "(2, Q c, m) L_B^-1 [U_qB P_q]",
     "nodes_own": "(2, Q c, Q c) G of the nodes without U",

@@ -31,7 +31,7 @@ from echospline.mechanics.kernels import ThinPlate
 from echospline.mechanics.pixel_field import PixelField
 from echospline.mechanics.response import NO_TIP, Precision, Response
 from echospline.mechanics.spline import Spline
-from echospline.mechanics.tip_patch import NODES
+from echospline.mechanics.tip_patch import PARTS
 from echospline.mechanics.touch import needle
 from echospline.needle import NeedlePose
 
@@ -147,8 +147,7 @@ class FusedStep:
         if how == 2:
             r.statistics.direct += 1
         if lacks:
-            a = r.scene
-            r.prepare((tip[1:3] - a.centre) / a.scale, (tip[1:3] - before[1:3]) / a.scale)
+            r.prepare(tip, before)
         return FusedState(table, tip, mesh, held_back)
 
     def _hold_back(
@@ -236,15 +235,16 @@ def _try_out(precision: Precision) -> None:
     for depth, speed in ((0.5, 1.0), (2.6, 1.0), (2.61, 1.0), (0.3, -1.0), (0.3, 0.0)):
         state = model.advance(state, NeedlePose((3.1, 0.0), (3.1, depth), speed), 0.1)
     r = model.response
-    r.prepare(np.zeros(2), np.zeros(2), rows=len(NODES))
+    tip = np.array([1.0, 2.2, 2.1, 0, 0, 1, 1, 0, 0, 0, 0, 0])
+    r.prepare(tip, tip, PARTS)
     r.set_contacts(np.arange(6))
     r.set_contacts(np.arange(3, 6))
     table = np.zeros((3, 7))
     table[:, 0] = np.arange(3, 6)
-    q, tip = np.zeros((3, 2)), np.zeros(12)
+    q = np.zeros((3, 2))
     r.field(table, q, tip)
     r.before(table, q, tip, 0.0, np.ones(2))
-    r.spline(table, q, np.array([1.0, 2.2, 2.1, 0, 0, 1, 1, 0, 0, 0, 0, 0]))
+    r.spline(table, q, tip)
 
 
 def _lines(places: Floats) -> Floats:

@@ -30,7 +30,7 @@ RESIDUAL = 1e-6
 """mm; misfit at the landmarks, for displacements of 1 mm, at which the response is rebuilt."""
 
 CATCH_UP = 3
-"""Rows of a patch that one step builds while the tip has none."""
+"""Parts of a patch that one step builds while the tip has none; otherwise one, so that no step takes long."""
 
 LINE = 64
 """Bytes in a cache line."""
@@ -55,7 +55,7 @@ class Statistics:
     patches : int
         How often a patch was begun for the tip.
     built : int
-        Rows of patches so far.
+        Points at which the rows of patches were built.
     direct : int
         How often the tip's row was evaluated directly.
     residual : float
@@ -234,24 +234,23 @@ class Response:
 
     # --- the tip's patches
 
-    def prepare(self, tip: Floats, motion: Floats, rows: int = CATCH_UP) -> None:
+    def prepare(self, tip: Floats, before: Floats, parts: int = CATCH_UP) -> None:
         """Go on building a patch for where a tip will be soon.
 
         Parameters
         ----------
-        tip, motion : ndarray, shape (2,)
-            Conditioned; ``motion`` is how far it moves in a step.
-        rows : int
-            How many of its rows to build now if the tip has no patch; otherwise one, so that no step takes long.
+        tip, before : ndarray, shape (12,)
+            As `touch.TIP`, now and a step ago.
+        parts : int
+            How many of its parts to build now if the tip has no patch; otherwise one.
         """
         if self.precision == "double":
             return
-        where = (float(tip[0]), float(tip[1]), float(motion[0]), float(motion[1]), rows)
-        begun, built = tend(self.basis, *where)
+        begun, built = tend(self.basis, tip, before, parts)
         while begun < 0:
             self._near_room(2 * self.near.shape[1])
             self._gather()
-            begun, built = tend(self.basis, *where)
+            begun, built = tend(self.basis, tip, before, parts)
         self.statistics.patches += begun
         self.statistics.built += built
 

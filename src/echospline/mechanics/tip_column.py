@@ -20,7 +20,7 @@ from echospline.mechanics.contacts import (
     times_M,
 )
 from echospline.mechanics.row_sums import BLOCK, sum_block
-from echospline.mechanics.tip_patch import AHEAD, DEGREE, HALF_WIDTH, NEAR, NODES, SMALLEST
+from echospline.mechanics.tip_patch import AHEAD, DEGREE, HALF_WIDTH, NEAR, NODES, PARTS, SMALLEST
 
 STALE = 5.0
 """How many times what is left of a tip contacts may carry of it before they are taken out of its patch's rows."""
@@ -61,7 +61,7 @@ def patch_at(b: Any, x: float, y: float) -> Any:
     """The patch that is ready and holds a point, or -1."""
     for p in range(2):
         square = b.squares[p]
-        ready = square[2] > 0.0 and b.built[p] == b.shares.shape[1]
+        ready = square[2] > 0.0 and b.built[p] == b.points.shape[1]
         if ready and abs(x - square[0]) <= square[2] and abs(y - square[1]) <= square[2]:
             return p
     return -1
@@ -119,9 +119,8 @@ def renew(b: Any, patch: int, first: int) -> None:
     newton, minus = np.empty((1, b.MT.shape[1])), np.empty((Qc, kc - first))
     for i in range(Qc):
         newton_of_node(b, patch, i, newton)
-        for z in range(first, kc):  # rows of one patch may be of different age
-            minus[i, z - first] = b.nodes_newton[patch, i, z] - newton[0, z]
-            b.nodes_newton[patch, i, z] = newton[0, z]
+        minus[i] = b.nodes_newton[patch, i, first:kc] - newton[0, first:kc]
+        b.nodes_newton[patch, i, first:kc] = newton[0, first:kc]
     rows = b.rows[patch * Qc : (patch + 1) * Qc]
     for start in range(0, N, CHUNK):
         stop = min(N, start + CHUNK)
@@ -293,7 +292,11 @@ def begin_patch(b: Any, patch: int) -> None:
         for a in range(Q * c):
             b.nodes_own[patch, i, a] = smooth_part(felt, i, held, a)
     contacts_and_nodes(b, patch, 0)
+    newton, kc = np.empty((1, b.MT.shape[1])), b.count[0] * c
     b.nodes_newton[patch] = 0.0
+    for i in range(Q * c):
+        newton_of_node(b, patch, i, newton)
+        b.nodes_newton[patch, i, :kc] = newton[0, :kc]
     for a in range(Q):
         for i in range(j):
             xx, xy, yy = kernel(form, places[0, i] - nodes[a, 0], places[1, i] - nodes[a, 1])
@@ -303,49 +306,42 @@ def begin_patch(b: Any, patch: int) -> None:
 
 
 @njit(**OPTIONS)
-def build_rows(b: Any, patch: int, count: int) -> None:
-    """The next rows of a patch."""
-    form, nodes = b.form, b.nodes[patch]
-    c, n, Q, kc = int(form[0]), b.points.shape[1], nodes.shape[0], b.count[0] * int(form[0])
-    begin = b.built[patch]
-    r = min(Q, begin + count) - begin
-    rc, newton = r * c, np.empty((1, b.MT.shape[1]))
-    minus_held, minus_newton = np.empty((rc, b.table.shape[0])), np.empty((rc, kc))
-    for i in range(rc):
-        newton_of_node(b, patch, begin * c + i, newton)
-        b.nodes_newton[patch, begin * c + i, :kc] = newton[0, :kc]
-        minus_held[i] = -b.nodes_held[patch, begin * c + i]
-        minus_newton[i] = -newton[0, :kc]
-    width = CHUNK // c
-    out = np.empty((rc, c * width))
-    for start in range(0, n, width):
-        w = min(n, start + width) - start
-        source_rows(b, nodes[begin : begin + r], minus_held, minus_newton, start, start + w, out)
-        for i in range(rc):
+def build_parts(b: Any, patch: int, parts: int) -> None:
+    """The rows of a patch at the next points: all rows at once, so that what they are made of is read once."""
+    c, n, Q, kc = int(b.form[0]), b.points.shape[1], b.nodes.shape[1], b.count[0] * int(b.form[0])
+    begin, Qc, width = b.built[patch], b.nodes.shape[1] * int(b.form[0]), CHUNK // 4
+    end = min(n, begin + parts * (-(-n // PARTS)))
+    minus_held, minus_newton = -b.nodes_held[patch], -b.nodes_newton[patch, :, :kc]
+    out = np.empty((Qc, c * width))
+    for start in range(begin, end, width):
+        w = min(end, start + width) - start
+        source_rows(b, b.nodes[patch], minus_held, minus_newton, start, start + w, out)
+        for i in range(Q * c):
             for e in range(c):
-                row = (patch * Q + begin) * c + i
-                keep(b.rows, b.single, row, e * n + start, out[i, e * w : (e + 1) * w])
-    b.built[patch] = begin + r
+                keep(b.rows, b.single, patch * Qc + i, e * n + start, out[i, e * w : (e + 1) * w])
+    b.built[patch] = end
 
 
 @njit(**OPTIONS)
-def tend(b: Any, x: float, y: float, dx: float, dy: float, rows: int) -> Any:
-    """Go on with a patch for where a tip at (x, y) that moves by (dx, dy) a step will be soon: begin one, or build the next
-    of its rows (``rows`` of them while the tip has no patch).
+def tend(b: Any, tip: Any, before: Any, parts: int) -> Any:
+    """Go on with a patch for where a tip that was ``before`` (`touch.TIP`) a step ago will be soon: begin one, or build the
+    next part of its rows (``parts`` while the tip has no patch).
 
     Returns
     -------
     begun, built : int
-        Patches and rows; -1 and 0 where there is no room to list the points close to a new one.
+        Patches and points; -1 and 0 where there is no room to list the points close to a new one.
     """
-    ahead_x, ahead_y, Q = x + AHEAD * dx, y + AHEAD * dy, b.nodes.shape[1]
+    x, y = (tip[1] - b.frame[0]) / b.frame[2], (tip[2] - b.frame[1]) / b.frame[2]
+    dx, dy = (tip[1] - before[1]) / b.frame[2], (tip[2] - before[2]) / b.frame[2]
+    ahead_x, ahead_y, n = x + AHEAD * dx, y + AHEAD * dy, b.points.shape[1]
     if patch_at(b, ahead_x, ahead_y) >= 0:
         return 0, 0
     serves, which = patch_at(b, x, y), -1
     for p in range(2):
         square = b.squares[p]
         inside = abs(ahead_x - square[0]) <= square[2] and abs(ahead_y - square[1]) <= square[2]
-        if square[2] > 0.0 and b.built[p] < Q and inside:
+        if square[2] > 0.0 and b.built[p] < n and inside:
             which = p
     begun = 0
     if which < 0:
@@ -359,7 +355,7 @@ def tend(b: Any, x: float, y: float, dx: float, dy: float, rows: int) -> Any:
         if serves >= 0:
             return begun, 0
     before = b.built[which]
-    build_rows(b, which, 1 if serves >= 0 else rows)
+    build_parts(b, which, 1 if serves >= 0 else parts)
     return begun, b.built[which] - before
 
 

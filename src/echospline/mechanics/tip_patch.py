@@ -57,8 +57,11 @@ def chebyshev(points: Floats, degree: int) -> Floats:
 NODES = padua(DEGREE)
 COEFFICIENTS = np.linalg.inv(chebyshev(NODES, DEGREE))
 
-AHEAD = len(NODES) + 2
-"""Steps before a tip leaves its patch that the next one is begun: a row each, and two to spare."""
+PARTS = 10
+"""Steps that build a patch, a share of the points each."""
+
+AHEAD = PARTS + 2
+"""Steps before a tip leaves its patch that the next one is begun: one to begin, one to spare."""
 
 LASTS = 6
 """Steps that a tip needs at least for half a width: a faster one costs less without patches, one row a step."""
