@@ -149,10 +149,10 @@ def move(
 @njit(**OPTIONS)
 def allowed(table: Any, before: Any, pose: Any, setting: Any) -> Any:
     """How far a node may move in this step, mm; the table has the displacements before it."""
-    longest = sqrt(before[3] * before[3] + before[4] * before[4]) if before[0] > 0.0 else 0.0
+    longest2 = before[3] * before[3] + before[4] * before[4] if before[0] > 0.0 else 0.0
     for j in range(table.shape[0]):
-        longest = max(longest, sqrt(table[j, 2] * table[j, 2] + table[j, 3] * table[j, 3]))
-    return CALM * (pose[8] + longest * -expm1(-setting[4] * pose[9])) + LET_GO
+        longest2 = max(longest2, table[j, 2] * table[j, 2] + table[j, 3] * table[j, 3])
+    return CALM * (pose[8] + sqrt(longest2) * -expm1(-setting[4] * pose[9])) + LET_GO
 
 
 @njit(**OPTIONS)
@@ -161,8 +161,9 @@ def released(table: Any, free: Any) -> Any:
     kept = 0
     for j in range(table.shape[0]):
         dx, dy = table[j, 2] - free[j, 0], table[j, 3] - free[j, 1]
-        if table[j, 1] > 0.0 or sqrt(dx * dx + dy * dy) > LET_GO:
-            table[kept] = table[j]
+        if table[j, 1] > 0.0 or dx * dx + dy * dy > LET_GO * LET_GO:
+            if kept < j:
+                table[kept] = table[j]
             kept += 1
     return kept
 

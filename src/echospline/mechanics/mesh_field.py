@@ -217,9 +217,10 @@ def spread(b: Any, k: int, tip: Any, on_tip: int, soft: float, was: Any) -> Any:
         x = b.sums[0]
         for start in range(0, 2 * n, BLOCK):
             sum_block(b.product, offsets, weights, count, start, b.sums)
-            for i in range(start, min(start + BLOCK, 2 * n)):
-                e = i // n
-                mesh[i - e * n, e] = x[i - start]
+            for i in range(start, min(start + BLOCK, n)):
+                mesh[i, 0] = x[i - start]
+            for i in range(max(start, n), min(start + BLOCK, 2 * n)):
+                mesh[i - n, 1] = x[i - start]
     if how == 1:
         add_near(b, px, py, sx, sy, mesh)
     change, reach = largest(b.at, b.watched, mesh, was)

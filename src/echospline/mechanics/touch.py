@@ -90,11 +90,11 @@ def touched(
     if depth < ZERO_LENGTH:
         return count
     far = (delta + drag * reach) * (1.0 + 1e-9) + 1e-9
-    px, py = places[0], places[1]
+    px, py, slope = places[0], places[1], 1.0 / ay
     for r in range(lines.shape[0] - 1):
         y, lo, hi = lines[r, 1], 0.0, depth
         if abs(ay) > PARALLEL:
-            above, below = (y - far - ey) / ay, (y + far - ey) / ay
+            above, below = (y - far - ey) * slope, (y + far - ey) * slope
             lo, hi = max(0.0, min(above, below)), min(depth, max(above, below))
         elif abs(y - ey) > far:
             continue
