@@ -127,6 +127,19 @@ def test_states_of_one_solver_are_refused_by_the_other():
         TPSModel(GRID, solver="magic")
 
 
+def test_a_node_at_delta_itself_is_touched_as_the_plain_reading_has_it():
+    # the node (10, 0) is 2 mm from the entry (12, 0) but for rounding, which depends on the way there
+    grid, parameters = RegularGrid((25, 19), (5 / 3, 5 / 3)), replace(PRINTED, delta=2.0)
+    slow = TPSModel(grid, parameters=parameters, solver="refit")
+    fast = TPSModel(grid, parameters=parameters, precision="double")
+    a, b = slow.rest(), fast.rest()
+    for depth in np.linspace(0.0, 20.0, 56):
+        tip = (12.0 + depth * np.cos(np.pi / 3), depth * np.sin(np.pi / 3))
+        pose = NeedlePose((12.0, 0.0), tip, 5.0)
+        a, b = slow.advance(a, pose, 0.1), fast.advance(b, pose, 0.1)
+        assert np.array_equal(a.contacts, fast.lattice[b.landmarks[:, 0].astype(int)]), depth
+
+
 class Handling(RuleBasedStateMachine):
     """Whatever a hand does, in any order, the fast step equals the refit."""
 

@@ -90,7 +90,7 @@ def touched(
     if depth < ZERO_LENGTH:
         return count
     far = (delta + drag * reach) * (1.0 + 1e-9) + 1e-9
-    px, py, slope = places[0], places[1], 1.0 / ay
+    px, py, slope, near2 = places[0], places[1], 1.0 / ay, delta * delta * (1.0 + 1e-9)
     for r in range(lines.shape[0] - 1):
         y, lo, hi = lines[r, 1], 0.0, depth
         if abs(ay) > PARALLEL:
@@ -107,7 +107,8 @@ def touched(
         while i < stop and px[i] <= right:
             n = at[i]
             along, d2 = distance(px[i], py[i], mesh[n, 0], mesh[n, 1], pose, drag)
-            if d2 <= delta * delta and along <= depth - gap:
+            # the root, for nodes at delta itself, as a lattice has them: its square would tell some of them apart by rounding
+            if d2 <= near2 and sqrt(d2) <= delta and along <= depth - gap:
                 which[count], alongs[count] = i, along
                 count += 1
             i += 1
