@@ -20,7 +20,7 @@ BLOCK = 64
 LANES = 16
 """Numbers in a vector of the loop; the compiler cuts it into the machine's own."""
 
-CALM = ["contract", "reassoc"]
+FLAGS = ["contract", "reassoc"]
 
 
 def _vectors_at_once() -> int:
@@ -77,8 +77,8 @@ def _sum_block(several: int) -> Any:
                     for v in range(at_once):
                         values = builder.load(vector_at(row, part + v), align=size)
                         for share, line in zip(spread, kept, strict=True):
-                            product = builder.fmul(share, values, flags=CALM)
-                            builder.store(builder.fadd(product, builder.load(line[v]), flags=CALM), line[v])
+                            product = builder.fmul(share, values, flags=FLAGS)
+                            builder.store(builder.fadd(product, builder.load(line[v]), flags=FLAGS), line[v])
                 for place, line in zip(sums, kept, strict=True):
                     for v in range(at_once):
                         builder.store(builder.load(line[v]), vector_at(place, part + v), align=size)
