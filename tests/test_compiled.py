@@ -25,3 +25,37 @@ def test_code_compiled_before_the_last_change_is_dropped(tmp_path):
     subprocess.run([sys.executable, "-c", code], check=True, env=environment, cwd=tmp_path)
     assert not (cache / "old.nbi").exists()
     assert (cache / "young.nbi").exists()
+
+
+LOOP = """
+import importlib
+from numba.core.dispatcher import Dispatcher
+from echospline.grid import RegularGrid
+from echospline.mechanics.tps import TPSModel
+from echospline.needle import NeedlePose
+from paths import wandering
+
+names = ("basis", "compiled", "compiled_step", "contacts", "mesh_field", "tip_column", "touch")
+modules = [importlib.import_module("echospline.mechanics." + name) for name in names]
+
+def known():
+    every = [(m.__name__, n, f) for m in modules for n, f in vars(m).items() if isinstance(f, Dispatcher)]
+    return {(m, n): len(f.signatures) for m, n, f in every}
+
+model = TPSModel(RegularGrid((27, 21), (40 / 26, 30 / 20)))
+before, state = known(), model.rest()
+for pose in wandering(2, 1 / 20, 5.0):
+    state = model.advance(state, pose, 1 / 20)
+assert state.held_back > 0
+state = model.advance(model.rest(), NeedlePose((20, 0), (20, 3), 5), 1)
+model.spline(state)
+print({name: count for name, count in known().items() if count != before[name]})
+"""
+
+
+def test_nothing_is_compiled_or_loaded_once_there_is_a_model():
+    # in a process of its own, that has compiled nothing else; steps held back, contacts released, whole numbers
+    done = subprocess.run(
+        [sys.executable, "-c", LOOP], capture_output=True, text=True, check=True, cwd=Path(__file__).parent
+    )
+    assert done.stdout.strip() == "{}"

@@ -144,7 +144,7 @@ class Response:
             If two of them lie too close together.
         """
         wanted = np.array(sources, dtype=np.int64).reshape(-1)
-        self._reserve(self.count + len(wanted))
+        self._reserve(len(wanted))  # those that leave go first
         joined, left, told_apart = change(self.basis, wanted)
         if not told_apart:
             raise SolverError(
@@ -168,7 +168,9 @@ class Response:
             If they cannot be had to `RESIDUAL`.
         """
         names = self.source_of[: self.count].copy()
-        self.forget()
+        self.counted[0] = 0
+        self.contact_of[:] = -1
+        self.squares[:] = 0.0
         _, _, told_apart = change(self.basis, names)
         self.statistics.rebuilt += 1
         worst = misfit(self.basis) if told_apart else np.inf
@@ -177,13 +179,6 @@ class Response:
                 f"the spline misses its landmarks by {worst:.1e} mm: two of the {len(names)} contacts lie too close "
                 "together; thin them out or give them a finite stiffness"
             )
-
-    def forget(self) -> None:
-        """Begin with no contacts and no patches."""
-        self.counted[0] = 0
-        self.contact_of[:] = -1
-        self.squares[:] = 0.0
-        self.built[:] = 0
 
     def _reserve(self, contacts: int) -> None:
         """Have room for that many contacts."""
@@ -218,7 +213,10 @@ class Response:
         self.product = self.rows if self.precision == "double" else self.single
         kind, m = self.product.dtype, len(s.table)
         width = self.MT.shape[1]
-        starts, node_starts = width * np.arange(room * c), width * c * np.arange(len(NODES))
+        starts, node_starts = (
+            width * np.arange(room * c, dtype=np.int64),
+            width * c * np.arange(len(NODES), dtype=np.int64),
+        )
         self.met, self.q, self.free = np.zeros(4), np.zeros((room, 2)), np.zeros((room, 2))
         self.t, cross, d, w = (_aligned((2, width), np.dtype(np.float64)) for _ in range(4))
         self.basis: Basis = new_basis(

@@ -25,7 +25,11 @@ FLAGS = ["contract", "reassoc"]
 
 def _vectors_at_once() -> int:
     """Vectors of a block whose sums fit into the registers together."""
-    return BLOCK // LANES if binding.get_host_cpu_features().get("avx512f", False) else BLOCK // LANES // 2
+    try:
+        wide = binding.get_host_cpu_features().get("avx512f", False)
+    except RuntimeError:  # not every processor can be asked
+        wide = False
+    return BLOCK // LANES if wide else BLOCK // LANES // 2
 
 
 def _sum_block(several: int) -> Any:

@@ -308,7 +308,7 @@ def begin_patch(b: Any, patch: int) -> None:
 @njit(**OPTIONS)
 def build_parts(b: Any, patch: int, parts: int) -> None:
     """The rows of a patch at the next points: all rows at once, so that what they are made of is read once."""
-    c, n, Q, kc = int(b.form[0]), b.points.shape[1], b.nodes.shape[1], b.count[0] * int(b.form[0])
+    c, n, kc = int(b.form[0]), b.points.shape[1], b.count[0] * int(b.form[0])
     begin, Qc, width = b.built[patch], b.nodes.shape[1] * int(b.form[0]), CHUNK // 4
     end = min(n, begin + parts * (-(-n // PARTS)))
     minus_held, minus_newton = -b.nodes_held[patch], -b.nodes_newton[patch, :, :kc]
@@ -316,7 +316,7 @@ def build_parts(b: Any, patch: int, parts: int) -> None:
     for start in range(begin, end, width):
         w = min(end, start + width) - start
         source_rows(b, b.nodes[patch], minus_held, minus_newton, start, start + w, out)
-        for i in range(Q * c):
+        for i in range(Qc):
             for e in range(c):
                 keep(b.rows, b.single, patch * Qc + i, e * n + start, out[i, e * w : (e + 1) * w])
     b.built[patch] = end
@@ -354,9 +354,9 @@ def tend(b: Any, tip: Any, before: Any, parts: int) -> Any:
         begun = 1
         if serves >= 0:
             return begun, 0
-    before = b.built[which]
+    done = b.built[which]
     build_parts(b, which, 1 if serves >= 0 else parts)
-    return begun, b.built[which] - before
+    return begun, b.built[which] - done
 
 
 @njit(**OPTIONS)
