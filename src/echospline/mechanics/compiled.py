@@ -90,6 +90,12 @@ def kernel(form: Any, dx: float, dy: float) -> Any:
 
 
 @njit(**OPTIONS)
+def component(xx: float, xy: float, yy: float, a: int, b: int) -> Any:
+    """Entry (a, b) of a symmetric kernel; xx with one component."""
+    return xx if a + b == 0 else (yy if a + b == 2 else xy)
+
+
+@njit(**OPTIONS)
 def kernel_rows(
     form: Any, points: Any, start: int, stop: int, x: float, y: float, out: Any, row: int
 ) -> None:

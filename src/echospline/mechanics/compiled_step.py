@@ -15,7 +15,7 @@ from numba import njit
 from echospline.mechanics.compiled import OPTIONS
 from echospline.mechanics.interaction import CALM, LET_GO
 from echospline.mechanics.mesh_field import combine, contacts_field, leaving, spoken_for, spread
-from echospline.mechanics.tip_column import meet, patch_at
+from echospline.mechanics.tip_column import conditioned, meet, patch_at
 from echospline.mechanics.tip_patch import AHEAD, HALF_WIDTH, LASTS
 from echospline.mechanics.touch import clearance, follow, load, needle, touch
 from echospline.needle import ZERO_LENGTH
@@ -101,7 +101,8 @@ def move(
     if kind == LEFT:
         x, y, soft = before[1], before[2], pose[14]
     if kind != NONE:
-        meet(b, (x - b.frame[0]) / b.frame[2], (y - b.frame[1]) / b.frame[2])
+        px, py = conditioned(b, x, y)
+        meet(b, px, py)
     if kind == GIVEN:
         tip[0], tip[1], tip[2], tip[5] = 1.0, x, y, 1.0
         tip[3], tip[4] = pose[2] + push * ax - x, pose[3] + push * ay - y
@@ -176,8 +177,8 @@ def lacks_patch(b: Any, tip: Any, before: Any) -> Any:
     dx, dy = tip[1] - before[1], tip[2] - before[2]
     if max(abs(dx), abs(dy)) * LASTS > HALF_WIDTH:
         return False
-    x, y = tip[1] + AHEAD * dx, tip[2] + AHEAD * dy
-    return patch_at(b, (x - b.frame[0]) / b.frame[2], (y - b.frame[1]) / b.frame[2]) < 0
+    x, y = conditioned(b, tip[1] + AHEAD * dx, tip[2] + AHEAD * dy)
+    return patch_at(b, x, y) < 0
 
 
 @njit(**OPTIONS)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from echospline.mechanics.compiled import CHUNK, OPTIONS, add_range, kernel, kernel_rows
+from echospline.mechanics.compiled import CHUNK, OPTIONS, add_range, component, kernel, kernel_rows
 from echospline.mechanics.row_sums import BLOCK, sum_block
 from echospline.mechanics.tip_patch import NEAR
 
@@ -31,7 +31,7 @@ def green(
     xx, xy, yy = kernel(form, x[i, 0] - y[j, 0], x[i, 1] - y[j, 1])
     for a in range(c):
         for b in range(c):
-            own = xx if a == 0 and b == 0 else (yy if a == 1 and b == 1 else xy)
+            own = component(xx, xy, yy, a, b)
             out[row + a, column + b] = own + smooth_part(felt, i * c + a, held, j * c + b)
 
 
@@ -122,7 +122,7 @@ def contacts_and_nodes(b: Any, patch: int, first: int) -> None:
                 for f in range(c):
                     value = smooth_part(b.felt, s * c + e, b.nodes_held[patch], a * c + f)
                     if not close:
-                        value += xx if e + f == 0 else (yy if e + f == 2 else xy)
+                        value += component(xx, xy, yy, e, f)
                     b.nodes_contacts[patch, a * c + f, j * c + e] = value
 
 

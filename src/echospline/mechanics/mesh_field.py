@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from echospline.mechanics.compiled import OPTIONS, bits, kernel, number
+from echospline.mechanics.compiled import OPTIONS, bits, component, kernel, number
 from echospline.mechanics.contacts import cholesky, cholesky_solve, smooth_part, times_M
 from echospline.mechanics.row_sums import BLOCK, sum_block, sum_block_twice
 from echospline.mechanics.tip_column import (
     add_near,
     combine_nodes,
+    conditioned,
     meet,
     meet_exactly,
     renew,
@@ -185,7 +186,7 @@ def spread(b: Any, k: int, tip: Any, on_tip: int, soft: float, was: Any) -> Any:
             weights[1, i] = w[1, i]
     how, count, sx, sy, px, py = 0, kc, 0.0, 0.0, 0.0, 0.0
     if tip[0] > 0.0 and on_tip < 0:
-        px, py = (tip[1] - b.frame[0]) / b.frame[2], (tip[2] - b.frame[1]) / b.frame[2]
+        px, py = conditioned(b, tip[1], tip[2])
         gx, gy = contacts_field(t, w, kc, c)
         sx, sy = tip_weights(b.met[1:4], soft, tip[3] - gx, tip[4] - gy, c)
         patch = int(b.met[0])
@@ -263,7 +264,8 @@ def field(b: Any, table: Any, q: Any, tip: Any, on_tip: int, soft: float, was: A
     """`spread` of landmarks that have not been met and combined yet."""
     combine(b, table, q if on_tip < 0 else spoken_for(q, tip, on_tip))
     if tip[0] > 0.0:
-        meet(b, (tip[1] - b.frame[0]) / b.frame[2], (tip[2] - b.frame[1]) / b.frame[2])
+        px, py = conditioned(b, tip[1], tip[2])
+        meet(b, px, py)
     return spread(b, table.shape[0], tip, on_tip, soft, was)
 
 
@@ -271,14 +273,14 @@ def field(b: Any, table: Any, q: Any, tip: Any, on_tip: int, soft: float, was: A
 def field_before(b: Any, table: Any, q: Any, before: Any, soft: float, x: float, y: float) -> Any:
     """Field at (x, y) mm of contacts q and the old tip ``before`` (absent: of the contacts alone)."""
     c, kc = int(b.form[0]), table.shape[0] * int(b.form[0])
-    px, py = (x - b.frame[0]) / b.frame[2], (y - b.frame[1]) / b.frame[2]
+    px, py = conditioned(b, x, y)
     combine(b, table, q)
     meet_exactly(b, px, py)
     vx, vy = contacts_field(b.t, b.w, kc, c)
     if before[0] == 0.0:
         return vx, vy
     here, felt = b.t[:, :kc].copy(), b.tip_felt.copy()
-    bx, by = (before[1] - b.frame[0]) / b.frame[2], (before[2] - b.frame[1]) / b.frame[2]
+    bx, by = conditioned(b, before[1], before[2])
     meet_exactly(b, bx, by)
     gx, gy = contacts_field(b.t, b.w, kc, c)
     sx, sy = tip_weights(b.met[1:4], soft, before[3] - gx, before[4] - gy, c)
@@ -286,8 +288,7 @@ def field_before(b: Any, table: Any, q: Any, before: Any, soft: float, x: float,
     xx, xy, yy = kernel(b.form, px - bx, py - by)
     for a in range(c):
         for f in range(c):
-            value = xx if a + f == 0 else (yy if a + f == 2 else xy)
-            value += smooth_part(felt, a, b.tip_held, f)
+            value = component(xx, xy, yy, a, f) + smooth_part(felt, a, b.tip_held, f)
             for i in range(kc):
                 value -= here[a, i] * b.t[f, i]
             e[a, f] = value

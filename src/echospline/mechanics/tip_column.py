@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from echospline.mechanics.compiled import CHUNK, OPTIONS, add_range, kernel, kernel_rows
+from echospline.mechanics.compiled import CHUNK, OPTIONS, add_range, component, kernel, kernel_rows
 from echospline.mechanics.contacts import (
     contacts_and_nodes,
     keep,
@@ -24,6 +24,12 @@ from echospline.mechanics.tip_patch import AHEAD, DEGREE, HALF_WIDTH, NEAR, NODE
 
 STALE = 5.0
 """How many times what is left of a tip contacts may carry of it before they are taken out of its patch's rows."""
+
+
+@njit(**OPTIONS)
+def conditioned(b: Any, x: float, y: float) -> Any:
+    """A point in mm as the kernel takes it."""
+    return (x - b.frame[0]) / b.frame[2], (y - b.frame[1]) / b.frame[2]
 
 
 @njit(**OPTIONS)
@@ -107,7 +113,7 @@ def newton_of_node(b: Any, patch: int, i: int, newton: Any) -> None:
         for e in range(c):
             cross[0, j * c + e] = between[i, j * c + e]
             if b.close[patch, j]:
-                cross[0, j * c + e] += xx if a + e == 0 else (yy if a + e == 2 else xy)
+                cross[0, j * c + e] += component(xx, xy, yy, a, e)
     times_M(b, cross, newton)
 
 
@@ -169,8 +175,8 @@ def meet_anchors(b: Any, x: float, y: float) -> None:
         xx, xy, yy = kernel(form, x - sources[s, 0], y - sources[s, 1])
         for a in range(c):
             for e in range(c):
-                value = xx if a + e == 0 else (yy if a + e == 2 else xy)
-                cross[a, j * c + e] = value + smooth_part(b.felt, s * c + e, held, a)
+                direct = component(xx, xy, yy, a, e)
+                cross[a, j * c + e] = direct + smooth_part(b.felt, s * c + e, held, a)
     for a in range(c):
         for e in range(c):
             own[a, e] = smooth_part(felt, a, held, e)
@@ -332,7 +338,7 @@ def tend(b: Any, tip: Any, before: Any, parts: int) -> Any:
     begun, built : int
         Patches and points; -1 and 0 where there is no room to list the points close to a new one.
     """
-    x, y = (tip[1] - b.frame[0]) / b.frame[2], (tip[2] - b.frame[1]) / b.frame[2]
+    x, y = conditioned(b, tip[1], tip[2])
     dx, dy = (tip[1] - before[1]) / b.frame[2], (tip[2] - before[2]) / b.frame[2]
     ahead_x, ahead_y, n = x + AHEAD * dx, y + AHEAD * dy, b.points.shape[1]
     if patch_at(b, ahead_x, ahead_y) >= 0:
