@@ -1,0 +1,234 @@
+/*
+ * echospline.h: tissue that a needle deforms, and its ultrasound picture, in memory. The C interface of the core.
+ *
+ * Scenes are read-only and shared by threads; one tissue, and one picture, belongs to one thread at a time.
+ *
+ * - A *scene* is what is given: mesh, clamped edges, parameters. It is factored once and never changes.
+ * - A *tissue* is one needle's session in a scene: the present state and the workspace that makes a step fast.
+ *   States are values: `echospline_state_save` and `echospline_state_load` carry them as versioned bytes.
+ * - A *picture* is a reference image, its deformation and the needle's echo.
+ *
+ * Conventions. Lengths in mm, times in s, angles in degrees. A point is (x lateral, y depth, z elevation); with dimension 2
+ * the third number is not read. Displacement is deformed minus reference. A mesh of shape (nx, ny[, nz]) numbers its nodes
+ * with x fastest. All arrays belong to the caller and are not kept unless a function says so.
+ *
+ * Errors. Functions return a status; `echospline_..._message` of the handle says in one sentence what was expected, what came and
+ * what to do. A `create` that fails still sets the handle, unless memory ran out: it only carries its message, and has
+ * to be destroyed. `destroy` takes NULL. Structs that grow carry `struct_size`; fill them with their `defaults` function.
+ */
+#ifndef ECHOSPLINE_H
+#define ECHOSPLINE_H
+
+#include <stdint.h>
+
+#define ECHOSPLINE_VERSION_MAJOR 0
+#define ECHOSPLINE_VERSION_MINOR 2
+#define ECHOSPLINE_VERSION_PATCH 0
+
+#if defined(ECHOSPLINE_STATIC)
+#define ECHOSPLINE_API
+#elif defined(_WIN32) && defined(ECHOSPLINE_BUILD)
+#define ECHOSPLINE_API __declspec(dllexport)
+#elif defined(_WIN32)
+#define ECHOSPLINE_API __declspec(dllimport)
+#else
+#define ECHOSPLINE_API __attribute__((visibility("default")))
+#endif
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/* ---- Status ------------------------------------------------------------------------------------------------------- */
+
+typedef int32_t echospline_status;
+enum {
+  ECHOSPLINE_OK = 0,
+  ECHOSPLINE_NULL_POINTER = 1,     /* a pointer that must be given is NULL */
+  ECHOSPLINE_WRONG_SIZE = 2,       /* a struct_size, count or shape that does not fit */
+  ECHOSPLINE_WRONG_VALUE = 3,      /* a number out of its range or not finite, an unknown choice */
+  ECHOSPLINE_OUT_OF_MEMORY = 4,    /* nothing has changed */
+  ECHOSPLINE_NOT_HELD = 5,         /* what is clamped does not determine the field */
+  ECHOSPLINE_NOT_SOLVED = 6,       /* landmarks cannot be told apart; the state has not changed */
+  ECHOSPLINE_WRONG_STATE = 7,      /* bytes of another version or scene, or damaged */
+  ECHOSPLINE_FAILED_HANDLE = 8     /* the handle's create had failed: it only carries a message */
+};
+
+/* Name of a status, for logs; never NULL. */
+ECHOSPLINE_API const char* echospline_status_text(echospline_status status);
+
+/* ---- Version and processor level ---------------------------------------------------------------------------------- */
+
+/* major * 65536 + minor * 256 + patch of the library; compare with ECHOSPLINE_VERSION_... of the header. */
+ECHOSPLINE_API uint32_t echospline_version(void);
+
+enum {
+  ECHOSPLINE_LEVEL_BEST = 0,       /* in options: what the processor has */
+  ECHOSPLINE_LEVEL_BASELINE = 1,   /* x86-64 with SSE2, or the plain level of another processor */
+  ECHOSPLINE_LEVEL_AVX2 = 2,       /* AVX2 and FMA */
+  ECHOSPLINE_LEVEL_AVX512 = 3,     /* AVX-512 F, BW, DQ, VL */
+  ECHOSPLINE_LEVEL_NEON = 4,
+  ECHOSPLINE_LEVEL_SIMD128 = 5     /* WebAssembly */
+};
+
+/* Best level that this library holds and this processor and system can run. */
+ECHOSPLINE_API int32_t echospline_level_best(void);
+/* 1 where a level can be asked for in options, else 0. */
+ECHOSPLINE_API int32_t echospline_level_available(int32_t level);
+/* Name of a level ("AVX2"), or "unknown"; never NULL. */
+ECHOSPLINE_API const char* echospline_level_name(int32_t level);
+
+/* ---- Scene -------------------------------------------------------------------------------------------------------- */
+
+enum { ECHOSPLINE_THIN_PLATE = 0, ECHOSPLINE_ELASTIC = 1 };          /* kernel */
+enum { ECHOSPLINE_SINGLE = 0, ECHOSPLINE_DOUBLE = 1 };               /* precision of the field */
+enum { ECHOSPLINE_TIP_POINT = 0, ECHOSPLINE_TIP_NODE = 1 };          /* landmark of the tip */
+enum { ECHOSPLINE_FOLLOW = 0, ECHOSPLINE_IMMEDIATE = 1 };            /* loading */
+enum { ECHOSPLINE_PLANE_STRESS = 0, ECHOSPLINE_PLANE_STRAIN = 1 };   /* elastic kernel in the plane */
+enum {                                                               /* clamped edges (2-D) or faces (3-D), bits */
+  ECHOSPLINE_LEFT = 1,    /* least x */
+  ECHOSPLINE_RIGHT = 2,
+  ECHOSPLINE_TOP = 4,     /* least y: at the probe */
+  ECHOSPLINE_BOTTOM = 8,
+  ECHOSPLINE_FRONT = 16,  /* least z, 3-D alone */
+  ECHOSPLINE_BACK = 32
+};
+
+typedef struct echospline_scene_options {
+  uint32_t struct_size;
+  int32_t dimension;         /* 2 or 3 */
+  int32_t kernel;            /* ECHOSPLINE_THIN_PLATE, equation (3), or ECHOSPLINE_ELASTIC */
+  int32_t precision;
+  int32_t tip;
+  int32_t loading;
+  int32_t plane;
+  uint32_t clamped;          /* bits of ECHOSPLINE_LEFT ... */
+  int32_t level;
+  int32_t shape[3];          /* nodes along x, y, z, 2 or more each */
+  double spacing[3];         /* mm */
+  double origin[3];          /* position of the first node, mm */
+  double sigma;              /* push of the tip, equation (12), mm */
+  double delta;              /* reach of friction around the shaft, equation (13), mm */
+  double alpha1, alpha2;     /* friction, equation (15), s */
+  double alpha3;             /* rate of relaxation, equation (16), 1/s */
+  double length;             /* length in the exponential of equation (15), mm */
+  double drag;               /* share of the shaft's sideways motion that contacts follow, 0 to 1 */
+  double contact_spacing;    /* distance between nodes that may become contacts, mm; 0: every node */
+  double anchor_spacing;     /* greatest distance between anchors along clamped edges, mm */
+  double poisson;            /* elastic kernel: Poisson's ratio */
+  double radius;             /* elastic kernel: regularisation length, mm */
+  const double* clamped_points;   /* (clamped_point_count, dimension) mm, or NULL */
+  int64_t clamped_point_count;
+  const double* stiffness;   /* per mesh node, how firmly a landmark there holds its displacement; NULL: infinitely */
+  int64_t stiffness_count;   /* number of mesh nodes, or 0 */
+  int64_t contact_room;      /* contacts for which memory is reserved; 0 chooses. More are possible and allocate once. */
+} echospline_scene_options;
+
+typedef struct echospline_scene echospline_scene;
+
+/* Fill options with the parameters of the paper's plane scene: left, right and bottom (and front and back) clamped. Shape and
+ * spacing have to be set. Does nothing when options is NULL or its struct_size is not set. */
+ECHOSPLINE_API void echospline_scene_defaults(echospline_scene_options* options);
+
+/* Factor a scene. The arrays that options point to are copied. */
+ECHOSPLINE_API echospline_status echospline_scene_create(const echospline_scene_options* options, echospline_scene** scene);
+ECHOSPLINE_API void echospline_scene_destroy(echospline_scene* scene);  /* after all its tissues */
+ECHOSPLINE_API const char* echospline_scene_message(const echospline_scene* scene);
+
+ECHOSPLINE_API int32_t echospline_scene_level(const echospline_scene* scene);
+ECHOSPLINE_API int64_t echospline_scene_node_count(const echospline_scene* scene);
+ECHOSPLINE_API int64_t echospline_scene_anchor_count(const echospline_scene* scene);
+ECHOSPLINE_API int64_t echospline_scene_source_count(const echospline_scene* scene);  /* nodes that may become contacts */
+/* Anchors, (anchor_count, dimension) mm; count: numbers that there is room for. */
+ECHOSPLINE_API echospline_status echospline_scene_anchors(echospline_scene* scene, double* anchors, int64_t count);
+/* Mesh nodes that may become contacts, ascending. */
+ECHOSPLINE_API echospline_status echospline_scene_sources(echospline_scene* scene, int64_t* nodes, int64_t count);
+
+/* ---- Needle ------------------------------------------------------------------------------------------------------- */
+
+typedef struct echospline_pose {
+  double entry[3];           /* n_s, mm */
+  double tip[3];             /* n_t, mm */
+  double speed;              /* of the tip along the axis relative to the entry, mm/s; negative on withdrawal */
+  double dt;                 /* time since the pose before, s, zero or more */
+} echospline_pose;
+
+typedef struct echospline_command {
+  double entry[3];           /* where the needle shall go, mm */
+  double tip[3];
+  double lag;                /* time constant with which it follows, s; 0: at once */
+  double fastest;            /* upper limit of its speed, mm/s */
+} echospline_command;
+
+/* Move a needle one step of next->dt seconds from now towards a command; fills entry, tip and speed of `next`. `next` may be `now`. */
+ECHOSPLINE_API echospline_status echospline_follow(const echospline_pose* now, const echospline_command* command,
+                                                   echospline_pose* next);
+
+/* ---- Tissue ------------------------------------------------------------------------------------------------------- */
+
+typedef struct echospline_tissue echospline_tissue;
+
+enum {                       /* kind of a landmark that moves */
+  ECHOSPLINE_CONTACT = 0,    /* a node that touches the shaft */
+  ECHOSPLINE_LEAVING = 1,    /* a node that has left it and relaxes */
+  ECHOSPLINE_TIP = 2,        /* the tip, pushing */
+  ECHOSPLINE_TIP_LEFT = 3    /* where the tip was, relaxing */
+};
+
+typedef struct echospline_landmark {
+  double place[3];           /* in the undeformed tissue, mm */
+  double displacement[3];    /* mm */
+  double grip[3];            /* of a contact: displacement across the axis less the shaft's position when it was touched, mm */
+  double along;              /* of a contact: where on the shaft it was touched, mm from the entry */
+  int64_t node;              /* mesh node; -1 for the tip */
+  int32_t kind;
+  int32_t reserved;
+} echospline_landmark;
+
+typedef struct echospline_statistics {
+  uint32_t struct_size;
+  int32_t reserved;
+  int64_t steps;             /* since the tissue was created */
+  int64_t joined, left;      /* contacts */
+  int64_t rebuilt;           /* times the contacts' inverse was made anew because rounding had grown */
+  int64_t held_back;         /* steps since rest in which the landmarks were slowed down so that the picture does not jump */
+  int64_t allocations;       /* made by steps; 0 as long as the reserved room is enough */
+  double residual;           /* largest misfit at the landmarks seen, mm for displacements of 1 mm */
+} echospline_statistics;
+
+/* A tissue at rest. The scene must live longer. */
+ECHOSPLINE_API echospline_status echospline_tissue_create(const echospline_scene* scene, echospline_tissue** tissue);
+ECHOSPLINE_API void echospline_tissue_destroy(echospline_tissue* tissue);
+ECHOSPLINE_API const char* echospline_tissue_message(const echospline_tissue* tissue);
+
+/* Back to rest: tissue that no needle has touched. */
+ECHOSPLINE_API echospline_status echospline_tissue_reset(echospline_tissue* tissue);
+/* Advance by one step: the needle has moved to pose in pose->dt seconds, equations (12) to (17). */
+ECHOSPLINE_API echospline_status echospline_advance(echospline_tissue* tissue, const echospline_pose* pose);
+
+/* Displacement of the mesh nodes, (node_count, dimension) mm; count: numbers that there is room for. */
+ECHOSPLINE_API echospline_status echospline_displacement(echospline_tissue* tissue, double* displacement, int64_t count);
+/* The same in single precision. */
+ECHOSPLINE_API echospline_status echospline_displacement_single(echospline_tissue* tissue, float* displacement, int64_t count);
+/* Displacement of any reference points (point_count, dimension) mm, in the scene's precision. */
+ECHOSPLINE_API echospline_status echospline_displacement_at(echospline_tissue* tissue, const double* points,
+                                                            int64_t point_count, double* displacement);
+/* Landmarks that move; `count` is set to their number, and no more than `room` are written. */
+ECHOSPLINE_API echospline_status echospline_landmarks(echospline_tissue* tissue, echospline_landmark* landmarks,
+                                                      int64_t room, int64_t* count);
+ECHOSPLINE_API echospline_status echospline_tissue_statistics(echospline_tissue* tissue, echospline_statistics* statistics);
+
+/* ---- States as values --------------------------------------------------------------------------------------------- */
+
+/* Bytes that the present state takes. */
+ECHOSPLINE_API int64_t echospline_state_size(const echospline_tissue* tissue);
+ECHOSPLINE_API echospline_status echospline_state_save(echospline_tissue* tissue, void* bytes, int64_t size);
+/* Make bytes of the same scene the present state. Bytes are checked; damaged ones change nothing. */
+ECHOSPLINE_API echospline_status echospline_state_load(echospline_tissue* tissue, const void* bytes, int64_t size);
+
+/* ---- Picture ------------------------------------------------------------------------------------------------------ */
+
+#ifdef __cplusplus
+}
+#endif
+#endif

@@ -1,0 +1,136 @@
+// Numbers in lanes: vectors as wide as the level's registers, by the vector extension that g++ and clang share. Loops over points are
+// written with them, because what compilers make of plain loops differs by a factor of three.
+#pragma once
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+
+#include "level_begin.hpp"
+
+#define ECHOSPLINE_INLINE inline __attribute__((always_inline))
+
+namespace echospline::ECHOSPLINE_CORE {
+
+#if defined(__AVX512F__)
+constexpr int WIDTH = 64;  // bytes of a register
+#elif defined(__AVX2__)
+constexpr int WIDTH = 32;
+#else
+constexpr int WIDTH = 16;
+#endif
+
+constexpr int LANES = WIDTH / 4;         // floats in a register
+constexpr int DOUBLE_LANES = WIDTH / 8;  // doubles in a register
+
+typedef float Floats __attribute__((vector_size(WIDTH)));
+typedef double Doubles __attribute__((vector_size(WIDTH)));
+typedef int32_t Ints __attribute__((vector_size(WIDTH)));
+typedef int64_t Longs __attribute__((vector_size(WIDTH)));
+typedef uint32_t Words __attribute__((vector_size(WIDTH)));
+
+/// The vector that belongs to a scalar type, its number of lanes and its mask type.
+template <class Real>
+struct Lanes;
+template <>
+struct Lanes<float> {
+  typedef Floats type;
+  typedef Ints mask;
+  static constexpr int count = LANES;
+};
+template <>
+struct Lanes<double> {
+  typedef Doubles type;
+  typedef Longs mask;
+  static constexpr int count = DOUBLE_LANES;
+};
+template <class Real>
+using Vector = typename Lanes<Real>::type;
+template <class Real>
+using Mask = typename Lanes<Real>::mask;
+
+template <class Real>
+ECHOSPLINE_INLINE Vector<Real> load(const Real* p) {
+  Vector<Real> v;
+  std::memcpy(&v, p, sizeof v);
+  return v;
+}
+template <class Real>
+ECHOSPLINE_INLINE void store(Real* p, Vector<Real> v) {
+  std::memcpy(p, &v, sizeof v);
+}
+/// Every lane the same number.
+template <class Real>
+ECHOSPLINE_INLINE Vector<Real> all(Real x) {
+  return Vector<Real>{} + x;
+}
+
+ECHOSPLINE_INLINE Floats pick(Ints where, Floats a, Floats b) { return (Floats)((where & (Ints)a) | (~where & (Ints)b)); }
+ECHOSPLINE_INLINE Doubles pick(Longs where, Doubles a, Doubles b) {
+  return (Doubles)((where & (Longs)a) | (~where & (Longs)b));
+}
+ECHOSPLINE_INLINE Ints pick(Ints where, Ints a, Ints b) { return (where & a) | (~where & b); }
+/// Smaller and larger of two numbers per lane; the second where the first is not a number.
+ECHOSPLINE_INLINE Floats least(Floats a, Floats b) { return a < b ? a : b; }
+ECHOSPLINE_INLINE Floats greatest(Floats a, Floats b) { return a > b ? a : b; }
+ECHOSPLINE_INLINE Doubles least(Doubles a, Doubles b) { return a < b ? a : b; }
+ECHOSPLINE_INLINE Doubles greatest(Doubles a, Doubles b) { return a > b ? a : b; }
+
+#if defined(__clang__)
+ECHOSPLINE_INLINE Floats root(Floats a) { return __builtin_elementwise_sqrt(a); }
+ECHOSPLINE_INLINE Doubles root(Doubles a) { return __builtin_elementwise_sqrt(a); }
+#else
+ECHOSPLINE_INLINE Floats root(Floats a) {
+  Floats r;
+  for (int i = 0; i < LANES; ++i) r[i] = __builtin_sqrtf(a[i]);
+  return r;
+}
+ECHOSPLINE_INLINE Doubles root(Doubles a) {
+  Doubles r;
+  for (int i = 0; i < DOUBLE_LANES; ++i) r[i] = __builtin_sqrt(a[i]);
+  return r;
+}
+#endif
+
+ECHOSPLINE_INLINE Floats to_floats(Ints a) { return __builtin_convertvector(a, Floats); }
+/// Whole numbers, towards zero.
+ECHOSPLINE_INLINE Ints to_ints(Floats a) { return __builtin_convertvector(a, Ints); }
+
+/// Natural logarithm to 1e-7 relative of positive numbers; finite at 0, where every use multiplies it by a power that vanishes.
+ECHOSPLINE_INLINE Floats logarithm(Floats x) {
+  const Ints bits = (Ints)x, exponent = (bits - 0x3f3504f3) >> 23;
+  const Floats m = (Floats)(bits - (exponent << 23)), s = (m - 1.0f) / (m + 1.0f), z = s * s;
+  Floats p = z * 0.2222222f + 0.28571430f;
+  p = p * z + 0.4f;
+  p = p * z + 0.66666667f;
+  return to_floats(exponent) * 0.69314718f + (s * 2.0f + s * z * p);
+}
+/// The same in double precision, lane by lane; 0 at 0.
+ECHOSPLINE_INLINE Doubles logarithm(Doubles x) {
+  Doubles r;
+  for (int i = 0; i < DOUBLE_LANES; ++i) r[i] = x[i] > 0 ? std::log(x[i]) : 0.0;
+  return r;
+}
+
+/// Sum over the lanes, in a fixed order.
+ECHOSPLINE_INLINE double total(Doubles v) {
+  double s = 0;
+  for (int i = 0; i < DOUBLE_LANES; ++i) s += v[i];
+  return s;
+}
+template <class Real>
+ECHOSPLINE_INLINE Real largest(Vector<Real> v) {
+  Real s = v[0];
+  for (int i = 1; i < Lanes<Real>::count; ++i) s = v[i] > s ? v[i] : s;
+  return s;
+}
+
+template <class T>
+constexpr T smaller(T a, T b) {
+  return b < a ? b : a;
+}
+template <class T>
+constexpr T larger(T a, T b) {
+  return a < b ? b : a;
+}
+
+}  // namespace echospline::ECHOSPLINE_CORE
