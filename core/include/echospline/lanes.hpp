@@ -58,19 +58,6 @@ template <class Real>
 ECHOSPLINE_INLINE void store(Real* p, Vector<Real> v) {
   std::memcpy(p, &v, sizeof v);
 }
-typedef float HalfFloats __attribute__((vector_size(WIDTH / 2)));
-/// Numbers of either precision as doubles, and back.
-ECHOSPLINE_INLINE Doubles load_doubles(const double* p) { return load(p); }
-ECHOSPLINE_INLINE Doubles load_doubles(const float* p) {
-  HalfFloats v;
-  std::memcpy(&v, p, sizeof v);
-  return __builtin_convertvector(v, Doubles);
-}
-ECHOSPLINE_INLINE void store_doubles(double* p, Doubles v) { store(p, v); }
-ECHOSPLINE_INLINE void store_doubles(float* p, Doubles v) {
-  const HalfFloats h = __builtin_convertvector(v, HalfFloats);
-  std::memcpy(p, &h, sizeof h);
-}
 /// Every lane the same number.
 template <class Real>
 ECHOSPLINE_INLINE Vector<Real> all(Real x) {

@@ -9,7 +9,8 @@
 // where the field is wanted.
 //
 // Weights of landmarks that stand close together are large and of both signs. So that single precision is enough, a column is kept as its
-// difference to that of the nearest contact at the time it joined, its parent; a parent then carries its children's weights beside its own.
+// difference to that of the nearest landmark at the time it joined, its parent: an anchor, whose column is zero, or another contact, which
+// then carries its children's weights beside its own.
 #pragma once
 #include "anchored_kernel.hpp"
 
@@ -63,37 +64,23 @@ struct Field {
 };
 
 /// [U_xB P_x] at points: what every column of G needs of them. Kept in the plane alone.
-template <int D, class Kernel, class Number>
+template <int D, class Kernel, class Real>
 struct Table {
   static constexpr int c = Kernel::components;
-  static constexpr int64_t block = VECTORS * Lanes<Number>::count;
-  Array<Number> values;  ///< (blocks, order, c, block)
-
-  bool reserve(int64_t order, int64_t room) { return values.reserve(order * c * room); }
-  void put(int64_t order, int64_t point, const double* rows, int64_t ld) {
-    Number* out = values.data() + point / block * order * c * block + point % block;
-    for (int64_t i = 0; i < order; ++i)
-      for (int a = 0; a < c; ++a, out += block) *out = static_cast<Number>(rows[a * ld + i]);
-  }
-};
-
-/// The table in the field's precision, for the tip at every step, and in double, for a contact's column when it joins.
-template <int D, class Kernel, class Real>
-struct Tables {
-  Table<D, Kernel, Real> step;
-  Table<D, Kernel, double> join;
+  static constexpr int64_t block = Points<D, Real>::block;
+  Array<Real> values;  ///< (blocks, order, c, block)
 
   bool build(const AnchoredKernel<D, Kernel>& anchored, const Points<D, Real>& points) {
     Array<double> rows;
-    if (!step.reserve(anchored.order, points.room()) || !join.reserve(anchored.order, points.room()) ||
-        !rows.reserve(Kernel::components * anchored.ld))
-      return false;
+    const int64_t m = anchored.order;
+    if (!values.reserve(points.blocks * m * c * block) || !rows.reserve(c * anchored.ld)) return false;
     for (int64_t j = 0; j < points.room(); ++j) {
       Vec<D> p;
       for (int d = 0; d < D; ++d) p[d] = points.x[d][j];
       anchored.felt(p, rows.data());
-      step.put(anchored.order, j, rows.data(), anchored.ld);
-      join.put(anchored.order, j, rows.data(), anchored.ld);
+      Real* out = values.data() + j / block * m * c * block + j % block;
+      for (int64_t i = 0; i < m; ++i)
+        for (int a = 0; a < c; ++a, out += block) *out = static_cast<Real>(rows[a * anchored.ld + i]);
     }
     return true;
   }
@@ -181,16 +168,16 @@ class Response {
   Array<Vec<D>> place;         ///< conditioned, (room)
   Array<double> felt, held;    ///< of the contacts, (room c, ld)
   Array<double> gram, P;       ///< (room c, ldk)
-  Array<int32_t> parent;       ///< slot whose column a contact's is relative to, or -1; (room)
+  Array<int32_t> parent;       ///< slot whose column a contact's is relative to; negative: an anchor's; (room)
   Array<int32_t> by_age;       ///< slots, the oldest first: parents stand before their children
   Array<Real> columns;         ///< less the parent's, in the plane: (blocks, room, c, planes, block)
   Array<Real> row_weights;     ///< as `field` reads them
   double residual = 0;
   int64_t rebuilt = 0;
 
-  bool build(const Anchored* anchored, const Points<D, Real>* points, const Tables<D, Kernel, Real>* tables, int64_t sources,
+  bool build(const Anchored* anchored, const Points<D, Real>* points, const Table<D, Kernel, Real>* table, int64_t sources,
              int64_t contacts) {
-    anchored_ = anchored, points_ = points, tables_ = tables;
+    anchored_ = anchored, points_ = points, table_ = table;
     if (!slot_of.reserve(sources)) return false;
     for (int64_t i = 0; i < sources; ++i) slot_of[i] = -1;
     return border_.reserve(anchored->ld, 0) && reserve(contacts);
@@ -300,9 +287,10 @@ class Response {
     }
     for (int a = 0; a < c; ++a)
       for (int e = 0; e < c; ++e) P[(kc + a) * ldk + kc + e] = V[a][e];
-    parent[k] = static_cast<int32_t>(nearest_contact(p)), by_age[k] = static_cast<int32_t>(k);
+    const Base base = nearest(p);
+    parent[k] = static_cast<int32_t>(base.slot), by_age[k] = static_cast<int32_t>(k);
     count = k + 1;
-    if constexpr (keeps_columns) keep_column(k);
+    if constexpr (keeps_columns) keep_column(k, base);
     return true;
   }
 
@@ -397,7 +385,7 @@ class Response {
  private:
   const Anchored* anchored_ = nullptr;
   const Points<D, Real>* points_ = nullptr;
-  const Tables<D, Kernel, Real>* tables_ = nullptr;
+  const Table<D, Kernel, Real>* table_ = nullptr;
   Tip border_;
   Displacements carried_;  ///< weights of contacts and all their descendants
 
@@ -458,15 +446,33 @@ class Response {
       if (parent[j] == static_cast<int32_t>(last)) parent[j] = gone;
     parent[slot] = parent[last];
   }
-  /// Contact nearest to a conditioned point, or -1.
-  int64_t nearest_contact(const Vec<D>& p) const {
-    int64_t nearest = -1;
+  /// Landmark that another's column is relative to.
+  struct Base {
+    Vec<D> place;    ///< conditioned
+    int64_t slot;    ///< of a contact, or negative
+    int64_t anchor;  ///< or negative
+
+    /// L_B^-1 [U P] of it: a unit vector for an anchor.
+    double held(const Response& own, int component, int64_t i) const {
+      if (slot >= 0) return own.held[(slot * c + component) * own.anchored_->ld + i];
+      return i == component * own.anchored_->anchors + anchor ? 1.0 : 0.0;
+    }
+  };
+  /// Landmark nearest to a conditioned point.
+  Base nearest(const Vec<D>& p) const {
+    Base base{{}, -1, -1};
     double least = INFINITY;
     for (int64_t j = 0; j < count; ++j) {
       const Vec<D> gap = place[j] - p;
-      if (dot(gap, gap) < least) least = dot(gap, gap), nearest = j;
+      if (dot(gap, gap) < least) least = dot(gap, gap), base = {place[j], j, -1};
     }
-    return nearest;
+    for (int64_t i = 0; i < anchored_->anchors; ++i) {
+      Vec<D> at;
+      for (int d = 0; d < D; ++d) at[d] = anchored_->place[d][i];
+      const Vec<D> gap = at - p;
+      if (dot(gap, gap) < least) least = dot(gap, gap), base = {at, -1, i};
+    }
+    return base;
   }
 
   /// Row and column of the last contact in place of those of a slot, and zeros where they were.
@@ -523,39 +529,55 @@ class Response {
 
   typedef Vector<Real> V;
 
-  /// Compute the column of a contact that has joined, less its parent's, in double: it is kept, and what it lacks stays in every field.
-  void keep_column(int64_t slot) {
-    constexpr int lanes = DOUBLE_LANES;
-    constexpr int64_t part = Table<D, Kernel, double>::block;
-    const int64_t from = parent[slot], ld = anchored_->ld;
-    double* h = border_.held.data();
-    if (from >= 0)
-      for (int64_t i = 0; i < c * ld; ++i) h[i] = held[slot * c * ld + i] - held[from * c * ld + i];
-    const double* t = tables_->join.values.data();
-    for (int64_t first = 0; first < points_->room(); first += part) {
-      Doubles a[c][planes][VECTORS];
+  /// Kernel at one vector of points from a place less from another: U_:p - U_:q.
+  ECHOSPLINE_INLINE void kernel_difference(int64_t at, const Vec<D>& p, const Vec<D>& q, V (&U)[c][c]) const {
+    V to_p[D], to_q[D];
+    for (int d = 0; d < D; ++d) to_p[d] = load(points_->x[d].data() + at) - static_cast<Real>(p[d]);
+    for (int d = 0; d < D; ++d) to_q[d] = to_p[d] + static_cast<Real>(p[d] - q[d]);
+    if constexpr (by_difference) {
+      V r2{}, other2{}, less{};
+      for (int d = 0; d < D; ++d) {
+        r2 += to_p[d] * to_p[d], other2 += to_q[d] * to_q[d];
+        less += static_cast<Real>(q[d] - p[d]) * (to_p[d] + to_q[d]);
+      }
+      U[0][0] = Kernel::difference(r2, other2, less);
+    } else {
+      V other[c][c];
+      anchored_->kernel.at(to_p, U);
+      anchored_->kernel.at(to_q, other);
+      for (int a = 0; a < c; ++a)
+        for (int e = 0; e < c; ++e) U[a][e] -= other[a][e];
+    }
+  }
+
+  /// Compute the column of a contact that has joined, less its parent's.
+  void keep_column(int64_t slot, const Base& base) {
+    constexpr int lanes = Lanes<Real>::count;
+    const int64_t ld = anchored_->ld, m = anchored_->order;
+    Real* h = row_weights.data() + room * c * D;
+    for (int64_t i = 0; i < m; ++i)
+      for (int e = 0; e < c; ++e)
+        h[i * c + e] = static_cast<Real>(held[(slot * c + e) * ld + i] - base.held(*this, e, i));
+    for (int64_t b = 0; b < points_->blocks; ++b) {
+      V a[c][planes][VECTORS];
       for (int v = 0; v < VECTORS; ++v) {
-        Doubles offset[D], U[c][c];
-        for (int d = 0; d < D; ++d) offset[d] = load_doubles(points_->x[d].data() + first + v * lanes) - place[slot][d];
-        anchored_->kernel.at(offset, U);
+        V U[c][c];
+        kernel_difference(b * block + v * lanes, place[slot], base.place, U);
         for (int e = 0; e < c; ++e)
           for (int d = 0; d < planes; ++d) a[e][d][v] = U[d][e];
-        if (from < 0) continue;
-        for (int d = 0; d < D; ++d) offset[d] = offset[d] + (place[slot][d] - place[from][d]);
-        anchored_->kernel.at(offset, U);
-        for (int e = 0; e < c; ++e)
-          for (int d = 0; d < planes; ++d) a[e][d][v] -= U[d][e];
       }
-      for (int64_t i = 0; i < anchored_->order; ++i)
-        for (int d = 0; d < planes; ++d, t += part)
+      const Real* t = table_->values.data() + b * m * c * block;
+      const Real* f = h;
+      for (int64_t i = 0; i < m; ++i, f += c)
+        for (int d = 0; d < planes; ++d, t += block)
           for (int v = 0; v < VECTORS; ++v) {
-            const Doubles value = load(t + v * lanes);
-            for (int e = 0; e < c; ++e) a[e][d][v] -= h[e * ld + i] * value;
+            const V value = load(t + v * lanes);
+            for (int e = 0; e < c; ++e) a[e][d][v] -= f[e] * value;
           }
-      Real* out = column(first / block, slot) + first % block;
+      Real* out = column(b, slot);
       for (int e = 0; e < c; ++e)
         for (int d = 0; d < planes; ++d)
-          for (int v = 0; v < VECTORS; ++v) store_doubles(out + (e * planes + d) * block + v * lanes, a[e][d][v]);
+          for (int v = 0; v < VECTORS; ++v, out += lanes) store(out, a[e][d][v]);
     }
   }
 
@@ -565,8 +587,8 @@ class Response {
     constexpr int lanes = Lanes<Real>::count;
     Real* weight = row_weights.data();
     Real* h = weight + room * c * D;
-    const int64_t base = by_difference && tip ? nearest_contact(tip->place) : -1;
-    carry(w, base, s);
+    const Base base = tip ? nearest(tip->place) : Base{{}, -1, -1};
+    carry(w, base.slot, s);
     // one weight per number of a column: (contact, component of the source), then the component of the field where one scalar serves all
     for (int64_t j = 0; j < kc; ++j)
       for (int r = 0; r < Displacements::count; ++r) weight[j * Displacements::count + r] = static_cast<Real>(carried_.side(r)[j]);
@@ -574,15 +596,15 @@ class Response {
     for (int d = 0; d < D; ++d) s_of[d] = static_cast<Real>(s[d]);
     if (tip)
       for (int64_t i = 0; i < m; ++i) {
-        double sum = base >= 0 ? -held[base * anchored_->ld + i] : 0.0;
-        for (int e = 0; e < c; ++e) sum += tip->held[e * anchored_->ld + i] * (c == 1 ? 1.0 : s[e]);
+        double sum = 0;
+        for (int e = 0; e < c; ++e) sum += (tip->held[e * anchored_->ld + i] - base.held(*this, e, i)) * (c == 1 ? 1.0 : s[e]);
         h[i] = static_cast<Real>(sum);
       }
     V change{}, reach{};
     for (int64_t b = 0; b < points_->blocks; ++b) {
       V u[D][VECTORS];
       if (tip) {
-        tip_block(b, tip->place, base, h, s_of, u);
+        tip_block(b, tip->place, base.place, h, s_of, u);
       } else {
         for (int d = 0; d < D; ++d)
           for (int v = 0; v < VECTORS; ++v) u[d][v] = V{};
@@ -617,27 +639,13 @@ class Response {
         for (int a = 0; a < c; ++a) carried_.side(r)[to * c + a] += carried_.side(r)[child * c + a];
     }
   }
-  /// The tip's part of one block: G_:p s, or (G_:p - G_:c) s where c is the contact `base`.
-  ECHOSPLINE_INLINE void tip_block(int64_t b, const Vec<D>& p, int64_t base, const Real* h, const Real (&s)[D], V (&u)[D][VECTORS]) const {
+  /// The tip's part of one block, relative to a landmark: (G_:p - G_:q) s.
+  ECHOSPLINE_INLINE void tip_block(int64_t b, const Vec<D>& p, const Vec<D>& q, const Real* h, const Real (&s)[D], V (&u)[D][VECTORS]) const {
     constexpr int lanes = Lanes<Real>::count;
     V a[planes][VECTORS];
     for (int v = 0; v < VECTORS; ++v) {
-      if constexpr (by_difference)
-        if (base >= 0) {
-          const Vec<D>& q = place[base];
-          V r2{}, other2{}, less{};
-          for (int d = 0; d < D; ++d) {
-            const V x = load(points_->x[d].data() + b * block + v * lanes);
-            const V to_tip = x - static_cast<Real>(p[d]), to_contact = x - static_cast<Real>(q[d]);
-            r2 += to_tip * to_tip, other2 += to_contact * to_contact;
-            less += static_cast<Real>(q[d] - p[d]) * (to_tip + to_contact);
-          }
-          a[0][v] = Kernel::difference(r2, other2, less);
-          continue;
-        }
-      V offset[D], U[c][c];
-      for (int d = 0; d < D; ++d) offset[d] = load(points_->x[d].data() + b * block + v * lanes) - static_cast<Real>(p[d]);
-      anchored_->kernel.at(offset, U);
+      V U[c][c];
+      kernel_difference(b * block + v * lanes, p, q, U);
       for (int d = 0; d < planes; ++d) {
         if constexpr (c == 1) {
           a[d][v] = U[0][0];
@@ -647,7 +655,7 @@ class Response {
         }
       }
     }
-    const Real* t = tables_->step.values.data() + b * anchored_->order * c * block;
+    const Real* t = table_->values.data() + b * anchored_->order * c * block;
     for (int64_t i = 0; i < anchored_->order; ++i)
       for (int d = 0; d < planes; ++d, t += block)
         for (int v = 0; v < VECTORS; ++v) a[d][v] -= h[i] * load(t + v * lanes);

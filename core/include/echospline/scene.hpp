@@ -26,7 +26,7 @@ struct Scene {
   Array<int64_t> at;        ///< which of the points every source is
   Points<D, Real> points;   ///< where the field is kept at every step
   Array<Real> mask;         ///< 1 at sources, else 0
-  Tables<D, Kernel, Real> tables;
+  Table<D, Kernel, Real> table;
   CoarseGrid<D> coarse;     ///< of a fine plane mesh
   int64_t contact_room = 0;
   uint64_t fingerprint = 0;  ///< of everything that a state depends on
@@ -80,7 +80,7 @@ struct Scene {
     }
     if (!there || !mask.reserve(points.room())) return false;
     for (int64_t i = 0; i < K; ++i) mask[at[i]] = 1;
-    if constexpr (D == 2) return tables.build(anchored, points);
+    if constexpr (D == 2) return table.build(anchored, points);
     return true;
   }
 };

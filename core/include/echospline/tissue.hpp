@@ -58,7 +58,7 @@ class Tissue {
 
   bool build() {
     const int64_t K = scene.sources();
-    return response_.build(&scene.anchored, &scene.points, &scene.tables, K, 1) &&
+    return response_.build(&scene.anchored, &scene.points, &scene.table, K, 1) &&
            field.reserve(scene.points.room()) && next_field_.reserve(scene.points.room()) &&
            rest_field_.reserve(scene.points.room()) && build_fine() && touched_.reserve(K) && alongs_.reserve(K) && wanted_.reserve(K) &&
            reserve(smaller(larger<int64_t>(scene.contact_room, 1), larger<int64_t>(K, 1)));
