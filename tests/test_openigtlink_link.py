@@ -13,14 +13,13 @@ import numpy as np
 import pytest
 
 from echospline.errors import InputError
+from echospline.openigtlink import Link, LinkLimits, Message, Status, String, Transform
 from echospline.openigtlink.decoder import Decoder
 from echospline.openigtlink.header import Header
 from echospline.openigtlink.image import Image
-from echospline.openigtlink.link import Link, LinkLimits
-from echospline.openigtlink.message import Message, Request, encode
+from echospline.openigtlink.message import Request, encode
 from echospline.openigtlink.peer import Patience, Peer
-from echospline.openigtlink.pose import Transform
-from echospline.openigtlink.text import NOT_FOUND, Capability, Status, String
+from echospline.openigtlink.text import NOT_FOUND, Capability
 
 GOLDEN = {
     p.stem: p.read_bytes() for p in sorted((Path(__file__).parent / "openigtlink" / "golden").glob("*.bin"))

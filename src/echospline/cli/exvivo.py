@@ -15,30 +15,36 @@ from rich.console import Console
 from rich.progress import track as counted
 from rich.table import Table
 
-from echospline.calibrate import PRINTED
-from echospline.charts_exvivo import error_per_depth, motion_maps
+from echospline.atomic import give_name, part_of, writing
 from echospline.cli.phantom import phantom_into
 from echospline.cli.track import load, tracker
-from echospline.deformation import Deformation
-from echospline.echo import EchoCine
 from echospline.errors import InputError
-from echospline.exvivo import Fit, Regions, compared, fit, regions, tracker_error
-from echospline.grid import RegularGrid
-from echospline.image import Cine
-from echospline.io import read_displacement
-from echospline.io.needle_path import read_needle
-from echospline.io.part import give_name, part_of, writing
-from echospline.mechanics.fem import FEMModel
-from echospline.mechanics.green import GreenModel
-from echospline.mechanics.tps import TPSModel
-from echospline.models import build_model
-from echospline.needle import Insertion
-from echospline.phantom import Displacement
-from echospline.phantom_cine import displacement_of
-from echospline.report import figure, paragraph, table, write_report
-from echospline.scenario import Scenario
+from echospline.io import read_displacement, read_needle
+from echospline.laboratory import Displacement, displacement_of
+from echospline.mechanics import FEMModel, GreenModel, TPSModel
+from echospline.picture import Deformation
+from echospline.scenario import Scenario, build_model
 from echospline.scenario import load as load_scenario
-from echospline.unit_fields import ForceFields, Observation, SplineFields, UnitFields
+from echospline.scene import Cine, EchoCine, Insertion, RegularGrid
+from echospline.study import (
+    PRINTED,
+    Fit,
+    ForceFields,
+    Observation,
+    Regions,
+    SplineFields,
+    UnitFields,
+    compared,
+    error_per_depth,
+    figure,
+    fit,
+    motion_maps,
+    paragraph,
+    regions,
+    table,
+    tracker_error,
+    write_report,
+)
 
 KINDS = ("tps", "elastic", "fem")
 
@@ -168,7 +174,7 @@ def study_exvivo(
 def _scene(path: Path | None) -> tuple[Scenario, Path]:
     if path is not None:
         return load_scenario(path), path.resolve().parent
-    with as_file(files("echospline.data").joinpath("exvivo.toml")) as inside:
+    with as_file(files("echospline").joinpath("data", "exvivo.toml")) as inside:
         return load_scenario(inside), Path.cwd()
 
 

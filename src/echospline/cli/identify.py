@@ -11,9 +11,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from echospline.calibrate import calibrate
 from echospline.errors import InputError
-from echospline.sweep import Task, sweep
+from echospline.study import Task, calibrate, sweep
 
 
 def identify(

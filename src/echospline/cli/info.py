@@ -13,13 +13,20 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from echospline import scenario
-from echospline.data import SAMPLES, sample_image
 from echospline.errors import InputError
-from echospline.io.displacement import displacement_shapes, read_displacement
-from echospline.io.kind import kind_of
-from echospline.io.reading import SAMPLE, open_recording
-from echospline.io.recording import LIMIT, MIB, Recording
+from echospline.io import (
+    LIMIT,
+    MIB,
+    SAMPLE,
+    SAMPLES,
+    Recording,
+    displacement_shapes,
+    kind_of,
+    open_recording,
+    read_displacement,
+    sample_image,
+)
+from echospline.scenario import LARGEST_FILE, Scenario, load
 
 
 def info(
@@ -169,19 +176,17 @@ def _of_displacement(path: Path, limit: float) -> dict[str, Any]:
 
 def _of_toml(path: Path) -> dict[str, Any]:
     """Describe a scenario; of another TOML file its tables alone."""
-    if path.stat().st_size > scenario.LARGEST_FILE:
-        raise InputError(
-            f"{path} has {path.stat().st_size:,} bytes; a scenario has {scenario.LARGEST_FILE:,} at most"
-        )
+    if path.stat().st_size > LARGEST_FILE:
+        raise InputError(f"{path} has {path.stat().st_size:,} bytes; a scenario has {LARGEST_FILE:,} at most")
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path} is no valid TOML: {' '.join(str(error).split())}") from error
-    if not set(document) & set(scenario.Scenario.model_fields):
+    if not set(document) & set(Scenario.model_fields):
         return {"format": "TOML, no scenario", "tables": _tables(document), "notes": []}
     about: dict[str, Any] = {"format": "TOML scenario", "tables": _tables(document), "notes": []}
     try:
-        run = scenario.load(path)
+        run = load(path)
     except InputError as error:
         about["notes"].append(f"cannot be run: {error}")
     else:

@@ -15,18 +15,19 @@ from threadpoolctl import threadpool_limits
 
 from echospline.cli.options import scenario_from, with_scenario_options
 from echospline.errors import InputError
-from echospline.image import UltrasoundImage
 from echospline.live import LiveEngine
-from echospline.models import MODELS, build_model
-from echospline.needle import NeedlePose
-from echospline.openigtlink.link import PORT
-from echospline.openigtlink.picture import Looks
-from echospline.openigtlink.plus import read_calibration
-from echospline.openigtlink.scene import Reach
-from echospline.openigtlink.session import Session
-from echospline.openigtlink.stage import Rates, SessionOptions, Stage
-from echospline.openigtlink.tracking import Naming
-from echospline.scenario import Scenario, load
+from echospline.openigtlink import (
+    PORT,
+    Looks,
+    Naming,
+    Rates,
+    Session,
+    SessionOptions,
+    Stage,
+    read_calibration,
+)
+from echospline.scenario import MODELS, Scenario, build_model, load
+from echospline.scene import NeedlePose, Reach, UltrasoundImage
 
 AXES = {
     "x": (1.0, 0.0, 0.0), "-x": (-1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0),

@@ -17,20 +17,11 @@ from threadpoolctl import threadpool_limits
 from echospline.cli.link import address, make_stage
 from echospline.cli.options import scenario_from, with_scenario_options
 from echospline.errors import InputError
-from echospline.image import UltrasoundImage
-from echospline.models import MODELS, build_model
-from echospline.needle_echo import NeedleEcho
-from echospline.openigtlink.link import PORT
-from echospline.openigtlink.picture import Looks
-from echospline.openigtlink.plus import read_calibration
-from echospline.openigtlink.session import Session
-from echospline.openigtlink.stage import Rates, SessionOptions
-from echospline.openigtlink.tracking import Naming
-from echospline.scenario import Scenario
-from echospline.viewer.exercise import default_exercises
-from echospline.viewer.scene import Scene
-from echospline.viewer.server import Settings, build_app, serve, steer
-from echospline.viewer.sessions import Sessions
+from echospline.openigtlink import PORT, Looks, Naming, Rates, Session, SessionOptions, read_calibration
+from echospline.picture import NeedleEcho
+from echospline.scenario import MODELS, Scenario, build_model
+from echospline.scene import UltrasoundImage
+from echospline.viewer import Scene, Sessions, Settings, build_app, default_exercises, serve, steer
 
 LABELS = {"tps": "TPS", "elastic": "Elastic", "green": "Green", "fem": "FEM"}
 

@@ -14,18 +14,13 @@ from rich.console import Console
 from rich.progress import track as counted
 
 from echospline.cli.options import scenario_from, with_scenario_options
-from echospline.echo import Echo
 from echospline.errors import InputError
-from echospline.image import UltrasoundImage
-from echospline.io import open_writer
-from echospline.io.echoes import EchoWriter
-from echospline.models import build_model
-from echospline.phantom import Phantom
-from echospline.phantom_cine import phantom_pictures
-from echospline.run import run
-from echospline.scenario import PHANTOM, Scenario
-from echospline.simulate import frame_count
-from echospline.speckle import speckle_statistics
+from echospline.io import EchoWriter, open_writer
+from echospline.laboratory import Phantom, phantom_pictures, speckle_statistics
+from echospline.picture import frame_count
+from echospline.scenario import PHANTOM, Scenario, build_model
+from echospline.scenario.run import run
+from echospline.scene import Echo, UltrasoundImage
 
 
 @with_scenario_options

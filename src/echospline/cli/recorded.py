@@ -13,15 +13,15 @@ import numpy as np
 import typer
 from threadpoolctl import threadpool_limits
 
+from echospline.atomic import part_of, writing
 from echospline.cli.link import axis_of
 from echospline.cli.options import scenario_from, with_scenario_options
 from echospline.errors import InputError
-from echospline.image import Pixels
-from echospline.io.part import part_of, writing
-from echospline.models import build_model
-from echospline.openigtlink.plus import read_calibration
-from echospline.sequence import SequenceWriter, read_sequence
-from echospline.simulate import simulate
+from echospline.io.sequence import SequenceWriter, read_sequence
+from echospline.openigtlink import read_calibration
+from echospline.picture import simulate
+from echospline.scenario import build_model
+from echospline.scene import Pixels
 
 
 @with_scenario_options

@@ -13,11 +13,10 @@ from rich.table import Table
 
 from echospline.cli.live import default_sessions
 from echospline.errors import InputError
-from echospline.models import build_model
-from echospline.run import run
-from echospline.scenario import validated
-from echospline.viewer.scoring import Trace, score
-from echospline.viewer.sessions import Sessions, sessions_csv, trace_csv
+from echospline.live import Trace
+from echospline.scenario import build_model, validated
+from echospline.scenario.run import run
+from echospline.viewer import Sessions, score, sessions_csv, trace_csv
 
 sessions = typer.Typer(
     no_args_is_help=True, help="Training sessions: list, export, score again, make a cine."

@@ -14,12 +14,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from echospline.cli.options import scenario_from, with_scenario_options
-from echospline.image import UltrasoundImage
-from echospline.models import build_model
-from echospline.rescatter import rescatter
-from echospline.run import run
-from echospline.scenario import Scenario
-from echospline.simulate import ImageFormer
+from echospline.laboratory import rescatter
+from echospline.picture import ImageFormer
+from echospline.scenario import Scenario, build_model
+from echospline.scenario.run import run
+from echospline.scene import UltrasoundImage
 
 Out = Annotated[Path, typer.Option("--out", help="folder for the results, made where it is not there")]
 Json = Annotated[bool, typer.Option("--json", help="print the report of the run as JSON, nothing else")]
@@ -49,7 +48,7 @@ def simulate(
 
 def demo(out: Out = Path("out/demo"), json_: Json = False) -> None:
     """Run the main job on the image that ships inside: a needle into calf muscle, in and out again."""
-    with as_file(files("echospline.data").joinpath("demo.toml")) as scenario:
+    with as_file(files("echospline").joinpath("data", "demo.toml")) as scenario:
         simulate_into(str(scenario), out, {}, as_json=json_)
 
 

@@ -14,19 +14,21 @@ import typer
 from rich.console import Console
 from rich.progress import track as counted
 
-from echospline.block_matching import BlockMatching
-from echospline.echo import Echo, EchoCine
 from echospline.errors import InputError
-from echospline.grid import Floats, RegularGrid
-from echospline.image import Cine
-from echospline.io import read
-from echospline.io.echoes import read_echoes
-from echospline.io.kind import head
-from echospline.io.needle_path import read_needle
-from echospline.io.tracks import write_track
-from echospline.needle import NeedlePose
-from echospline.region import grid_over, inside_ahead, region_ahead
-from echospline.tracking import FlowTracker, Reference, Track, Tracker, grey_pair
+from echospline.io import head, read, read_echoes, read_needle
+from echospline.scene import Cine, Echo, EchoCine, Floats, NeedlePose, RegularGrid
+from echospline.tracking import (
+    BlockMatching,
+    FlowTracker,
+    Reference,
+    Track,
+    Tracker,
+    grey_pair,
+    grid_over,
+    inside_ahead,
+    region_ahead,
+    write_track,
+)
 from echospline.tracking import track as follow
 
 
@@ -220,7 +222,7 @@ def summary(found: Track, seconds: float) -> dict[str, Any]:
 def draw(frames: Cine | EchoCine, found: Track, poses: list[NeedlePose] | None, path: Path) -> None:
     """Draw the arrows of the frame that moved most over the first picture."""
     # matplotlib takes long to load
-    from echospline.plot import tracking_figure  # noqa: PLC0415
+    from echospline.picture.summary import tracking_figure  # noqa: PLC0415
 
     grey, _, grid = grey_pair(frames[0], frames[0])
     size = np.hypot(found.displacement[..., 0], found.displacement[..., 1]) * (found.confidence >= 0.3)

@@ -14,12 +14,11 @@ from typing import IO, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from echospline.atomic import give_name, part_of, writing
 from echospline.errors import InputError
-from echospline.grid import Floats, RegularGrid, as_points
 from echospline.io.kind import head
-from echospline.io.part import give_name, part_of, writing
 from echospline.io.recording import LIMIT, MIB, decoding
-from echospline.needle import NeedlePose
+from echospline.scene import Floats, NeedlePose, RegularGrid, as_points
 
 KEYS = ("points", "displacement", "times", "tip", "entry", "speed")
 _HEADER = 128

@@ -10,11 +10,10 @@ from typing import IO, Self
 
 import numpy as np
 
-from echospline.echo import Echo, EchoCine
+from echospline.atomic import give_name, part_of, writing
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
-from echospline.io.part import give_name, part_of, writing
 from echospline.io.recording import LIMIT, MIB, decoding
+from echospline.scene import Echo, EchoCine, RegularGrid
 
 KEYS = ("iq", "times", "spacing", "origin", "carrier")
 

@@ -10,11 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from echospline.errors import InputError
-from echospline.grid import Floats
-from echospline.image import Pixels
 from echospline.io.kind import kind_of
-from echospline.io.picture import open_picture
 from echospline.io.recording import Recording, check_size, decoding
+from echospline.io.still import open_picture
+from echospline.scene import Floats, Pixels
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 _TABLE = "times.csv"

@@ -10,8 +10,7 @@ import av
 import numpy as np
 from PIL import Image
 
-from echospline.grid import RegularGrid
-from echospline.image import Pixels
+from echospline.scene import Pixels, RegularGrid
 
 TICK = 100
 """GIF counts delays in hundredths of a second."""

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from echospline.errors import InputError, MissingExtraError
-from echospline.image import Pixels
+from echospline.scene import Pixels
 
 
 def lossless_frames(

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
-from echospline.image import Pixels
+from echospline.scene import Pixels, RegularGrid
 
 _TYPES = {
     "int8": "MET_CHAR", "uint8": "MET_UCHAR", "int16": "MET_SHORT", "uint16": "MET_USHORT",

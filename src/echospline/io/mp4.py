@@ -11,9 +11,8 @@ import numpy as np
 from av.video.reformatter import ColorRange, Colorspace
 
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
-from echospline.image import Pixels
 from echospline.io.tag import spacing_tag
+from echospline.scene import Pixels, RegularGrid
 
 CLOCK = 90_000
 """Ticks per second: the usual clock of video, finer than any frame rate."""

@@ -10,7 +10,7 @@ import numpy as np
 from echospline.errors import InputError
 from echospline.io.displacement import read_displacement
 from echospline.io.kind import head
-from echospline.needle import Insertion
+from echospline.scene import Insertion
 
 COLUMNS = ("time_s", "entry_x_mm", "entry_y_mm", "tip_x_mm", "tip_y_mm")
 LARGEST = 50_000_000

@@ -9,12 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from echospline.data import SAMPLES, sample_image
 from echospline.errors import InputError
-from echospline.grid import Floats, RegularGrid
-from echospline.image import Cine, Pixels, UltrasoundImage
 from echospline.io.kind import READABLE, kind_of
 from echospline.io.recording import LIMIT, MIB, Box, Recording, check_size, to_grey
+from echospline.io.samples import SAMPLES, sample_image
+from echospline.scene import Cine, Floats, Pixels, RegularGrid, UltrasoundImage
 
 SAMPLE = "sample:"
 
@@ -178,7 +177,7 @@ def open_recording(path: str | Path, limit: float = LIMIT, *, whole: bool = True
     # The readers' libraries are large: each is imported when a file of its kind comes.
     header_limit = limit if whole else float("inf")
     if kind in ("picture", "gif"):
-        from echospline.io.picture import open_picture  # noqa: PLC0415
+        from echospline.io.still import open_picture  # noqa: PLC0415
 
         recording = open_picture(path, name, header_limit)
     elif kind == "dicom":

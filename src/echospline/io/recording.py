@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from echospline.errors import EchosplineError, InputError
-from echospline.grid import Floats
-from echospline.image import Pixels
+from echospline.scene import Floats, Pixels
 
 Box = tuple[int, int, int, int]
 """(left, top, right, bottom) in pixels of the file; right and bottom lie just outside."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from math import isfinite
 
-from echospline.grid import RegularGrid
+from echospline.scene import RegularGrid
 
 _LINE = re.compile(r"echospline: pixels of ([0-9.e+-]{1,32}) mm lateral, ([0-9.e+-]{1,32}) mm depth")
 

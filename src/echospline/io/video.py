@@ -10,10 +10,9 @@ import av
 import numpy as np
 
 from echospline.errors import InputError
-from echospline.grid import Floats
-from echospline.image import Pixels
 from echospline.io.recording import Recording, check_size, decoding
 from echospline.io.tag import tagged_spacing
+from echospline.scene import Floats, Pixels
 
 _DEMUXERS = {"MP4": "mov", "QuickTime": "mov", "AVI": "avi", "Matroska": "matroska", "WebM": "matroska"}
 """The one demuxer tried for each format: others of FFmpeg's follow references to other files."""

@@ -18,10 +18,9 @@ import numpy as np
 import SimpleITK
 
 from echospline.errors import InputError
-from echospline.grid import Floats
-from echospline.image import Pixels
 from echospline.io.kind import Kind
 from echospline.io.recording import Recording, check_size, decoding
+from echospline.scene import Floats, Pixels
 
 _ITK: Any = SimpleITK
 """SimpleITK, whose functions carry no types."""

@@ -10,10 +10,9 @@ from typing import Protocol, Self
 
 import numpy as np
 
+from echospline.atomic import give_name, part_of, writing
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
-from echospline.image import Pixels
-from echospline.io.part import give_name, part_of, writing
+from echospline.scene import Pixels, RegularGrid
 
 FORMATS = (".mp4", ".gif", ".mha")
 

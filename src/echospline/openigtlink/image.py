@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echospline.errors import InputError, ProtocolError
-from echospline.grid import Floats
 from echospline.openigtlink.ndarray import SCALARS, scalar_code
-from echospline.openigtlink.pose import as_transform
+from echospline.scene import Floats, as_transform
 
 _HEAD = struct.Struct(">HBBBB3H12f3H3H")
 _LPS = np.diag([-1.0, -1.0, 1.0, 1.0])

@@ -10,7 +10,8 @@ from xml.sax.saxutils import quoteattr
 
 from echospline.errors import InputError
 from echospline.openigtlink.message import Message
-from echospline.openigtlink.text import UNKNOWN_ERROR, Command, CommandReply, Status, String
+from echospline.openigtlink.stage import Stage
+from echospline.openigtlink.text import UNKNOWN_ERROR, CommandMessage, CommandReply, Status, String
 
 LONGEST = 16 * 1024
 """Characters of an order."""
@@ -52,7 +53,7 @@ def order_of(message: Message) -> Order | None:
     content = message.content
     if isinstance(content, CommandReply):
         return None
-    if isinstance(content, Command):
+    if isinstance(content, CommandMessage):
         return (
             _from_xml(content.text)
             if content.text.lstrip().startswith("<")
@@ -89,6 +90,38 @@ def _named(name: str, argument: str) -> Order:
     return Order(NAMES[key], argument.strip())
 
 
+def carry_out(order: Order, stage: Stage) -> str:
+    """Carry out an order, other than to load a scenario; returns a sentence for the peer.
+
+    Raises
+    ------
+    InputError
+        If the stage has no such model or no planned insertion.
+    """
+    engine, insertion = stage.engine, stage.insertion
+    if order.name == "start":
+        if insertion is None:
+            raise InputError("there is no planned insertion to start: load a scenario that has one")
+        engine.freeze(False)
+        times = (k * engine.period for k in range(1, int(insertion.duration / engine.period) + 1))
+        engine.replay(insertion.pose(float(insertion.times[0]) + t) for t in times)
+        return f"the planned insertion runs, {insertion.duration:.1f} s"
+    if order.name == "stop":
+        engine.freeze(True)
+        return "time stands still"
+    if order.name == "reset":
+        engine.reset()
+        return "needle and tissue are at rest"
+    if order.name in ("freeze", "unfreeze"):
+        on = order.name == "freeze" and order.argument.lower() not in ("off", "false", "0")
+        engine.freeze(on)
+        return "time stands still" if on else "time runs"
+    if order.argument not in stage.models:
+        raise InputError(f"a model is one of {', '.join(stage.models)}; got {order.argument!r}")
+    engine.switch(order.argument)
+    return f"the tissue is {order.argument} now"
+
+
 def answer(message: Message, text: str, *, done: bool) -> Message:
     """Tell the peer what became of its order, in the form in which it asked.
 
@@ -105,7 +138,7 @@ def answer(message: Message, text: str, *, done: bool) -> Message:
     status = "SUCCESS" if done else "FAIL"
     xml = f"<CommandReply Status={quoteattr(status)} Message={quoteattr(text)} />"
     content = message.content
-    if isinstance(content, Command):
+    if isinstance(content, CommandMessage):
         error = "" if done else text.encode("ascii", "replace").decode()[:100]
         said = CommandReply(content.id, error, xml)
         return Message(

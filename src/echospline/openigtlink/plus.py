@@ -8,8 +8,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from echospline.errors import InputError
-from echospline.grid import Floats
-from echospline.openigtlink.frames import frames_of
+from echospline.scene import Floats, frames_of
 
 LARGEST = 2**20
 """Bytes of a device set file."""

@@ -8,8 +8,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from echospline.errors import InputError, ProtocolError
-from echospline.grid import Floats
+from echospline.errors import ProtocolError
+from echospline.scene import Floats, as_transform
 
 _COLUMNS = struct.Struct(">12f")
 
@@ -94,20 +94,3 @@ class Position:
                 [0.0, 0.0, 0.0, 1.0],
             ]
         )
-
-
-def as_transform(matrix: Floats) -> Floats:
-    """Check a 4 x 4 matrix and return it as float64.
-
-    Raises
-    ------
-    InputError
-        If the shape is another, a number is not finite or the last row is not 0 0 0 1.
-    """
-    array = np.array(matrix, dtype=np.float64)
-    if array.shape != (4, 4):
-        raise InputError(f"a transform is a 4 x 4 matrix; got shape {array.shape}")
-    if not np.isfinite(array).all() or not np.array_equal(array[3], (0, 0, 0, 1)):
-        raise InputError(f"a transform has finite numbers and the last row 0 0 0 1; got {array.tolist()}")
-    array.setflags(write=False)
-    return array

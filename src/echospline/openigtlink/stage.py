@@ -6,12 +6,10 @@ from dataclasses import dataclass, field
 from math import isfinite
 
 from echospline.errors import InputError
-from echospline.image import UltrasoundImage
 from echospline.live import LiveEngine
-from echospline.needle import Insertion
 from echospline.openigtlink.link import PORT, LinkLimits
-from echospline.openigtlink.picture import Looks
-from echospline.openigtlink.scene import Reach
+from echospline.openigtlink.outgoing import Looks
+from echospline.scene import Insertion, Reach, UltrasoundImage
 
 
 @dataclass(frozen=True)

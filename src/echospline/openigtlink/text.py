@@ -70,7 +70,7 @@ class Status:
 
 
 @dataclass(frozen=True)
-class Command:
+class CommandMessage:
     """COMMAND: a numbered order; its text is free, Slicer and PLUS write XML."""
 
     TYPE: ClassVar[str] = "COMMAND"
@@ -99,8 +99,8 @@ class Command:
 
 
 @dataclass(frozen=True)
-class CommandReply(Command):
-    """RTS_COMMAND: the answer to the `Command` of the same number; its name is the error's, empty if none."""
+class CommandReply(CommandMessage):
+    """RTS_COMMAND: the answer to the `CommandMessage` of the same number; its name is the error's, empty if none."""
 
     TYPE: ClassVar[str] = "RTS_COMMAND"
 

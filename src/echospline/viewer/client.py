@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
-from echospline.errors import EchosplineError, InputError
-from echospline.live import LiveEngine, Numbered, Pacer, Snapshot
-from echospline.needle import NeedlePose
+from echospline.errors import EchosplineError, InputError, ProtocolError
+from echospline.live import LiveEngine, Numbered, Pacer, Recorder, Snapshot, Trace
+from echospline.scene import NeedlePose
 from echospline.viewer import protocol
 from echospline.viewer.exercise import Exercise
 from echospline.viewer.guard import Allowance
-from echospline.viewer.scene import Scene, tip_of
-from echospline.viewer.scoring import Recorder, Score, Trace, score
+from echospline.viewer.scoring import Score, score
+from echospline.viewer.served_scene import Scene, tip_of
 from echospline.viewer.sessions import Sessions
 
 log = logging.getLogger(__name__)
@@ -133,20 +133,20 @@ class Client:
                 return
             if (data := message.get("bytes")) is not None:
                 if not self._commands.take():
-                    raise protocol.ProtocolError("too many messages: this page was closed for flooding")
+                    raise ProtocolError("too many messages: this page was closed for flooding")
                 self._take_command(protocol.decode_command(data))
             else:
                 if not self._requests.take():
-                    raise protocol.ProtocolError("too many requests: this page was closed for flooding")
+                    raise ProtocolError("too many requests: this page was closed for flooding")
                 await self._answer(protocol.decode_request(message["text"]))
 
     def _take_command(self, command: protocol.PoseCommand) -> None:
         if command.drawn > self._sent or command.drawn < self._drawn:
-            raise protocol.ProtocolError(
+            raise ProtocolError(
                 f"frames {self._drawn} to {self._sent} can have been drawn now; got {command.drawn}"
             )
         if command.number <= self._number:
-            raise protocol.ProtocolError(f"command numbers ascend; got {command.number} after {self._number}")
+            raise ProtocolError(f"command numbers ascend; got {command.number} after {self._number}")
         if command.drawn > self._drawn:
             now = asyncio.get_running_loop().time()
             self._intervals.append(now - self._reported)
@@ -309,7 +309,7 @@ class Client:
         """Close with the reason, if the page is still there."""
         if error is None or isinstance(error, asyncio.CancelledError | WebSocketDisconnect):
             return
-        if isinstance(error, protocol.ProtocolError):
+        if isinstance(error, ProtocolError):
             log.warning("client closed: %s", error)
             code, reason = 1008, str(error)
         else:

@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
-from echospline.sections import DiscSection as Disc
-from echospline.sections import ExerciseSection as Exercise
+from echospline.scenario import DiscSection as Disc
+from echospline.scenario import ExerciseSection as Exercise
+from echospline.scene import RegularGrid
 
 __all__ = ["Disc", "Exercise", "check_exercises", "default_exercises"]
 

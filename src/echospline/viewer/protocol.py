@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from echospline.errors import InputError
+from echospline.errors import ProtocolError
 from echospline.live import Snapshot
 
 VERSION = 1
@@ -39,10 +39,6 @@ REQUEST_BYTES = 4096
 
 MAX_LENGTH = 1000.0
 """mm; no coordinate or depth of a command lies beyond it."""
-
-
-class ProtocolError(InputError):
-    """A message that breaks the protocol; its client is closed with the reason."""
 
 
 @dataclass(frozen=True, slots=True)

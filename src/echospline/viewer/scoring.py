@@ -7,7 +7,6 @@ integral of the squared jerk. Unlike there, the target is where the *deformed* t
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import asdict, dataclass
 from math import inf, isfinite
 
@@ -15,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echospline.errors import InputError
-from echospline.grid import Floats
-from echospline.live import Snapshot
-from echospline.needle import NeedlePose
+from echospline.live import Trace
+from echospline.scene import Floats
 from echospline.viewer.exercise import Exercise
 
 INSIDE = 0.5
@@ -27,134 +25,6 @@ TURN, TURN_REST = 3.0, 0.5
 JERK_INTERVAL = 0.05
 """s; positions are averaged over this long before the third difference is taken, or it would measure
 the rate of the pointer's events instead of the hand."""
-MOST_ROWS, MOST_WATCHED = 2_000_000, 64
-
-
-@dataclass(frozen=True)
-class Trace:
-    """A recorded insertion, one row per step of the engine.
-
-    Parameters
-    ----------
-    period : float
-        s.
-    poses : ndarray, shape (n, 5)
-        entry x, y, tip x, y (mm), speed (mm/s).
-    watched : ndarray, shape (n, k, 2)
-        Deformed positions of target and vessels, mm.
-    """
-
-    period: float
-    poses: Floats
-    watched: Floats
-
-    def __len__(self) -> int:
-        return len(self.poses)
-
-    @property
-    def times(self) -> Floats:
-        """Times after the start, s, shape (n,)."""
-        times: Floats = self.period * np.arange(1, len(self) + 1, dtype=np.float64)
-        return times
-
-    @property
-    def entry(self) -> Floats:
-        """Points of entry, shape (n, 2), mm."""
-        return self.poses[:, 0:2]
-
-    @property
-    def tip(self) -> Floats:
-        """Tips, shape (n, 2), mm."""
-        return self.poses[:, 2:4]
-
-    @property
-    def depth(self) -> Floats:
-        """Insertion depths, shape (n,), mm."""
-        along = self.tip - self.entry
-        depth: Floats = np.hypot(along[:, 0], along[:, 1])
-        return depth
-
-    def pose(self, row: int) -> NeedlePose:
-        """One pose."""
-        x, y, tx, ty, speed = (float(v) for v in self.poses[row])
-        return NeedlePose((x, y), (tx, ty), speed)
-
-    def to_bytes(self) -> bytes:
-        """Compress to bytes for storage."""
-        n, k = len(self), self.watched.shape[1]
-        head = np.array([self.period, n, k], "<f8").tobytes()
-        return head + zlib.compress(
-            np.hstack([self.poses, self.watched.reshape(n, 2 * k)]).astype("<f8").tobytes()
-        )
-
-    @classmethod
-    def from_bytes(cls, data: bytes) -> Trace:
-        """Read what `to_bytes` wrote; sizes are checked before anything is unpacked.
-
-        Raises
-        ------
-        InputError
-            If the bytes are something else.
-        """
-        if len(data) < 24:
-            raise InputError("a stored trace is cut short")
-        period, n, k = np.frombuffer(data[:24], "<f8")
-        if not (isfinite(period) and period > 0 and 0 <= n <= MOST_ROWS and 0 <= k <= MOST_WATCHED):
-            raise InputError("a stored trace has no valid head")
-        size = int(n) * (5 + 2 * int(k)) * 8
-        inflate = zlib.decompressobj()
-        try:
-            content = inflate.decompress(data[24:], size + 1)
-        except zlib.error as error:
-            raise InputError("a stored trace is damaged") from error
-        if len(content) != size or not inflate.eof:
-            raise InputError("a stored trace has another length than its head says")
-        rows = np.frombuffer(content, "<f8").reshape(int(n), 5 + 2 * int(k))
-        if not np.isfinite(rows).all():
-            raise InputError("a stored trace has numbers that are not finite")
-        return cls(float(period), rows[:, :5].copy(), rows[:, 5:].reshape(int(n), int(k), 2).copy())
-
-
-class Recorder:
-    """Collects the rows of a `Trace`; observe an engine with it.
-
-    A reset of the engine begins the recording anew, and frozen time is not recorded. It ends by itself
-    after ``longest`` seconds.
-    """
-
-    def __init__(self, period: float, longest: float) -> None:
-        self.period = period
-        self._most = max(1, round(longest / period))
-        self._time = 0.0
-        self._rows: list[tuple[float, ...]] = []
-        self._watched: list[Floats] = []
-
-    def __call__(self, snapshot: Snapshot) -> None:
-        """Take one snapshot."""
-        if snapshot.time < self._time:
-            self._rows, self._watched = [], []
-        moved, self._time = snapshot.time != self._time, snapshot.time
-        if moved and not self.over:
-            pose = snapshot.pose
-            self._rows.append((*pose.entry, *pose.tip, pose.speed))
-            self._watched.append(snapshot.watched)
-
-    @property
-    def over(self) -> bool:
-        """Whether the time is up."""
-        return len(self._rows) >= self._most
-
-    @property
-    def elapsed(self) -> float:
-        """Recorded so far, s."""
-        return self.period * len(self._rows)
-
-    def trace(self) -> Trace:
-        """Return what was recorded so far."""
-        if not self._rows:
-            return Trace(self.period, np.empty((0, 5)), np.empty((0, 1, 2)))
-        count = min(len(self._rows), len(self._watched))
-        return Trace(self.period, np.array(self._rows[:count]), np.stack(self._watched[:count]))
 
 
 @dataclass(frozen=True)

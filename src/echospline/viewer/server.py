@@ -27,11 +27,11 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from echospline.errors import EchosplineError, InputError
-from echospline.needle import NeedlePose
+from echospline.scene import NeedlePose
 from echospline.viewer.client import Client, Seat
 from echospline.viewer.guard import SUBPROTOCOL, Guard
 from echospline.viewer.protocol import COMMAND_BYTES, REQUEST_BYTES
-from echospline.viewer.scene import Scene, SceneOpener, grey_bytes
+from echospline.viewer.served_scene import Scene, SceneOpener, grey_bytes
 from echospline.viewer.sessions import Sessions, sessions_csv, trace_csv
 
 log = logging.getLogger(__name__)

@@ -16,8 +16,9 @@ from typing import Any
 from pydantic import ValidationError
 
 from echospline.errors import InputError
+from echospline.live import Trace
 from echospline.viewer.exercise import Exercise
-from echospline.viewer.scoring import Score, Trace
+from echospline.viewer.scoring import Score
 
 SCHEMA_VERSION = 1
 _SCHEMA = """
