@@ -1,4 +1,4 @@
-"""Temporary names: a file gets its final name only when it is whole."""
+"""Files that appear whole: a file is written under a temporary name and renamed once it is complete."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from echospline.errors import EchosplineError, InputError
 
 
 def part_of(path: Path) -> Path:
-    """Name of a file while it is written: beside the final one, so that renaming is one step."""
+    """Return the temporary name of a file: in the folder of the final one, so that renaming is one step."""
     return path.with_name(path.name + ".part")
 
 
 def give_name(part: Path, path: Path) -> None:
     """Sync a whole file or folder to the disk and give it its final name in one step."""
     if part.is_dir():
-        # A folder cannot be renamed onto a full one: the old one steps aside first.
+        # A folder cannot be renamed onto a full one: the old one is renamed first.
         old = path.with_name(path.name + ".old")
         if path.exists():
             os.replace(path, old)
@@ -34,7 +34,7 @@ def give_name(part: Path, path: Path) -> None:
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Turn what the disk and the encoders say into one sentence."""
+    """Turn errors of the disk and of encoders into one sentence."""
     try:
         yield
     except EchosplineError:

@@ -301,7 +301,7 @@ SUMMARY = {
 
 
 def _summary(means: Mapping[str, float]) -> list[dict[str, Any]]:
-    """Means over the depths, one row per model, um."""
+    """Return the means over the depths, one row per model, um."""
     rows = []
     for kind in KINDS:
         values = {k: means.get(f"{kind}_{k}_mm") for k in SUMMARY if k != "model"}

@@ -97,7 +97,7 @@ def identify(
 
 
 def _names(fields: list[str]) -> list[str]:
-    """One name per field, from its file or folder, numbered where two are alike."""
+    """Name each field after its file or folder, numbered where two are equal."""
     stems = []
     for field in fields:
         path = Path(field).resolve()

@@ -204,7 +204,7 @@ def _tables(document: dict[str, Any]) -> dict[str, Any]:
 
 
 def _size(columns: int, rows: int, spacing: tuple[float, float]) -> list[float]:
-    """Width and depth in mm, whole pixels included."""
+    """Return the width and depth in mm, whole pixels included."""
     return [round(columns * spacing[0], 4), round(rows * spacing[1], 4)]
 
 

@@ -181,7 +181,7 @@ def make_stage(
     rate: float = 120.0,
     targets: list[tuple[float, float]] | None = None,
 ) -> Stage:
-    """Image, tissue and needle of a scenario, ready to run live.
+    """Build the image, tissue and needle of a scenario, ready to run live.
 
     Parameters
     ----------
@@ -261,7 +261,7 @@ def _point(text: str) -> tuple[float, float]:
 
 
 def axis_of(text: str) -> tuple[float, float, float]:
-    """Unit vector of ``x``, ``-x``, ... ``-z``.
+    """Return the unit vector of ``x``, ``-x``, ... ``-z``.
 
     Raises
     ------

@@ -125,7 +125,7 @@ def live(
 
 
 def scene_of(scenario: Scenario, image: UltrasoundImage, folder: Path) -> Scene:
-    """Scene of a scenario: its image, mesh and needle, every model, its exercises or the usual three.
+    """Build the scene of a scenario: its image, mesh and needle, every model, its exercises or the default three.
 
     Raises
     ------
@@ -159,7 +159,7 @@ def scene_of(scenario: Scenario, image: UltrasoundImage, folder: Path) -> Scene:
 
 
 def _whole(scenario: Scenario, folder: Path) -> str:
-    """Name of the image that is valid from anywhere."""
+    """Return the name of the image that is valid in every folder."""
     file = scenario.image.file
     return file if file.startswith("sample:") else str((folder / file).resolve())
 

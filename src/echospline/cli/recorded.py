@@ -106,7 +106,7 @@ def recorded(
 
 
 def correlation(first: Pixels, second: Pixels) -> float:
-    """Normalised cross-correlation of two pictures, -1 to 1; 0 where one is uniform."""
+    """Compute the normalised cross-correlation of two pictures, -1 to 1; 0 where one is uniform."""
     a, b = first.astype(np.float64), second.astype(np.float64)
     a, b = a - a.mean(), b - b.mean()
     scale = float(np.sqrt((a * a).sum() * (b * b).sum()))

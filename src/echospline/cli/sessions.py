@@ -109,7 +109,7 @@ def cine(
 
 
 def keyframes(trace: Trace) -> list[tuple[float, float, float, float, float]]:
-    """Rows of time, entry and tip for a scenario's path, at most 60 a second, first and last included."""
+    """Return the rows of time, entry and tip for a scenario's path, at most 60 a second, first and last included."""
     if len(trace) < 2:
         raise InputError("this session holds no motion")
     stride = max(1, int(1.0 / (KEYFRAMES_PER_SECOND * trace.period)))

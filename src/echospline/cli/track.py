@@ -194,7 +194,7 @@ def numbers(text: str, count: int, option: str) -> list[float]:
 
 
 def swept(poses: Iterable[NeedlePose], distance: float, grid: RegularGrid) -> Floats:
-    """Points of the region ahead of the tip over all frames, on one lattice of 0.2 mm, inside the picture."""
+    """Return the points of the region ahead of the tip over all frames, on one lattice of 0.2 mm, inside the picture."""
     found = [region_ahead(pose, distance) for pose in poses if pose.depth > 0]
     points = np.concatenate(found) if found else np.empty((0, 2))
     lattice = np.unique(np.rint(points / 0.2).astype(int), axis=0) * 0.2

@@ -1,4 +1,4 @@
-"""``echoes.npz``: complex baseband frames beside their grid and carrier, written frame by frame, read checked."""
+"""``echoes.npz``: complex baseband frames with their grid and carrier, written frame by frame and checked when read."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class EchoWriter:
     path : Path
         Ends in ``.npz``.
     frames : int
-        How many will come.
+        Number of frames.
     grid : RegularGrid
         Of the samples.
     carrier : float

@@ -1,4 +1,4 @@
-"""A cine as a folder of numbered PNG files beside ``times.csv``."""
+"""A cine as a folder of numbered PNG files with ``times.csv``."""
 
 from __future__ import annotations
 

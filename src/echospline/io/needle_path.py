@@ -1,4 +1,4 @@
-"""A needle's path on disk: CSV rows of time, entry and tip, or the needle inside of a ``displacement.npz``."""
+"""A needle's path on disk: CSV rows of time, entry and tip, or the needle in a ``displacement.npz``."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def read_needle(path: str | Path) -> Insertion:
     Raises
     ------
     InputError
-        If the file is neither, or its numbers make no path.
+        If the file is neither, or its numbers are not a path.
     """
     path = Path(path)
     if head(path).startswith(b"PK"):

@@ -1,4 +1,4 @@
-"""The ultrasound that ships with the package; where each image comes from is in data/SOURCES.md."""
+"""The ultrasound images that ship with the package; data/SOURCES.md names their origin."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recorded procedures: images beside tracked transforms, as PLUS (.igs.mha) and 3D Slicer (.seq.nrrd) keep them."""
+"""Recorded procedures: images with tracked transforms, in the formats of PLUS (.igs.mha) and 3D Slicer (.seq.nrrd)."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from echospline.scene import (
 )
 
 NEEDLE, ENTRY, IMAGE, REFERENCE = "NeedleTip", "NeedleEntry", "Image", "Reference"
-"""Frames that echospline writes; NeedleEntry is where the shaft passes the skin, so that nothing need be guessed."""
+"""Frames that echospline writes; NeedleEntry is the point where the shaft passes the skin, so that a reader need not guess it."""
 
 
 @dataclass(frozen=True)
 class Sequence:
-    """Frames beside times and the transforms that were tracked with them.
+    """Frames with their times and the transforms tracked with them.
 
     Parameters
     ----------
@@ -44,13 +44,13 @@ class Sequence:
     times : ndarray, shape (n,)
         Seconds, as recorded.
     transforms : mapping of str to ndarray, shape (n, 4, 4)
-        By name (``NeedleTipToReference``); NaN where the tracker did not see the tool.
+        By name (``NeedleTipToReference``); NaN where the tracker lost the tool.
     valid : ndarray, shape (n,), bool
         Frames whose picture is good.
     spacing : (lateral, depth), optional
         mm per pixel, where the file has it.
     source : str
-        Where it comes from.
+        Its origin.
     """
 
     frames: Pixels
@@ -66,16 +66,16 @@ class Sequence:
         return len(self.frames)
 
     def known(self, index: int) -> dict[str, Floats]:
-        """Transforms that were valid at one frame."""
+        """Return the transforms that were valid at one frame."""
         return {name: m[index] for name, m in self.transforms.items() if np.isfinite(m[index]).all()}
 
     def grid(self, spacing: tuple[float, float] | None = None) -> RegularGrid:
-        """Pixels in mm; the spacing given, else the calibration's (Image to any frame), else the file's.
+        """Return the pixel grid in mm; the spacing given, else the calibration's (Image to any frame), else the file's.
 
         Raises
         ------
         InputError
-            If nobody knows the spacing.
+            If neither the caller nor the file gives a spacing.
         """
         rows, columns = self.frames.shape[1:3]
         found = spacing or self._calibrated() or self.spacing
@@ -95,12 +95,12 @@ class Sequence:
         return None
 
     def cine(self, spacing: tuple[float, float] | None = None) -> Cine:
-        """Good frames, times from 0."""
+        """Return the good frames, with times from 0."""
         times = self.times[self.valid]
         return Cine(self.frames[self.valid], times - times[0], self.grid(spacing), self.source)
 
     def image(self, spacing: tuple[float, float] | None = None) -> UltrasoundImage:
-        """First good frame: tissue that the needle has not moved yet, if the recording began before it."""
+        """Return the first good frame: tissue that the needle has not moved yet, if the recording began before it."""
         return UltrasoundImage(self.frames[np.argmax(self.valid)], self.grid(spacing), self.source)
 
     def insertion(
@@ -112,7 +112,7 @@ class Sequence:
         calibration: Mapping[str, Floats] | None = None,
         reach: Reach | None = None,
     ) -> Insertion:
-        """Path of the needle in the imaging plane, times from the first good frame.
+        """Return the path of the needle in the imaging plane, times from the first good frame.
 
         Frames in which the tracker lost needle or probe are bridged by straight lines.
 
@@ -121,13 +121,13 @@ class Sequence:
         needle : str
             Frame at the needle's tip (``NeedleTip``, ``StylusTip``).
         spacing : (lateral, depth), optional
-            mm per pixel, if the recording does not know it.
+            mm per pixel, if the recording has none.
         axis : (x, y, z)
             Direction of insertion in that frame.
         calibration : mapping of str to ndarray, optional
             Fixed transforms that the recording lacks (``NeedleTipToNeedle``, ``ImageToProbe``).
         reach : Reach, optional
-            How far from the plane the needle still counts.
+            Distances from the plane within which the needle counts.
 
         Raises
         ------
@@ -163,7 +163,7 @@ def _pose(
     grid: RegularGrid,
     reach: Reach,
 ) -> NeedlePose | None:
-    # Any frame that both know will do: the plane is laid there, the needle is seen from it.
+    # Any frame common to both serves: the plane is placed in it, and the needle is converted from it.
     for frame in sorted({f for name in known for f in frames_of(name)} - {IMAGE}):
         image = transform_between(known, IMAGE, frame)
         tip = transform_between(known, needle, frame)
@@ -187,7 +187,7 @@ def read_sequence(path: str | Path, *, limit: float = 2048.0) -> Sequence:
     path : path
         ``.mha``, ``.mhd`` or ``.nrrd``, pixels raw or compressed.
     limit : float
-        MiB that the pixels may take.
+        MiB that the pixels may fill.
 
     Raises
     ------
@@ -220,7 +220,7 @@ def read_sequence(path: str | Path, *, limit: float = 2048.0) -> Sequence:
 class SequenceWriter:
     """Writes a run frame by frame: pixels, time, image and needle transforms; use it as a context.
 
-    The file carries its name only when it is whole; on an exception nothing of that name is left or changed.
+    The file gets its name only when it is whole; after an exception no file of that name is written or changed.
 
     Parameters
     ----------
@@ -229,7 +229,7 @@ class SequenceWriter:
     grid : RegularGrid
         Pixels in mm.
     plane : ImagingPlane, optional
-        Where the picture lies; Slicer's axial plane when not given.
+        Plane of the picture; Slicer's axial plane when not given.
 
     Raises
     ------
@@ -282,7 +282,7 @@ class SequenceWriter:
             self._spool.write(np.ascontiguousarray(pixels, dtype=pixels.dtype.newbyteorder("<")).tobytes())
 
     def close(self) -> Path:
-        """Put header and pixels together and give the file its name.
+        """Join header and pixels and give the file its name.
 
         Raises
         ------
@@ -316,7 +316,7 @@ class SequenceWriter:
         return self.path
 
     def abandon(self) -> None:
-        """Leave nothing behind."""
+        """Remove the temporary files."""
         self._drop_spool()
         self._part.unlink(missing_ok=True)
 

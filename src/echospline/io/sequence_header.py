@@ -36,7 +36,7 @@ _FRAME_FIELD = re.compile(r"Seq_Frame(\d{1,7})_(\w+)")
 
 @dataclass(frozen=True)
 class Header:
-    """What a sequence's header says.
+    """Content of a sequence's header.
 
     Parameters
     ----------
@@ -210,7 +210,7 @@ def _shape(sizes: list[int], channels: int) -> tuple[int, ...]:
 
 
 def _known_spacing(spacing: list[float]) -> tuple[float, float] | None:
-    # PLUS writes 1 1 whatever the picture: that is no spacing
+    # PLUS writes 1 1 for every picture: that is no spacing
     if len(spacing) < 2 or spacing == [1.0, 1.0] or not all(math.isfinite(s) and s > 0 for s in spacing):
         return None
     return spacing[0], spacing[1]
@@ -224,7 +224,7 @@ def _frames(
     lost: list[tuple[str, int]] = []
     for key, value in fields.items():
         match = _FRAME_FIELD.fullmatch(key)
-        assert match is not None  # the caller has chosen them so
+        assert match is not None  # the caller has chosen these types
         frame, name = int(match[1]), match[2]
         if frame >= count:
             raise InputError(f"{path}: {key} is beyond the last frame {count - 1}")
@@ -262,7 +262,7 @@ def _numbers(value: str, count: int, key: str, path: Path) -> list[float]:
 
 
 def _index_values(top: Mapping[str, str], count: int) -> Floats:
-    """Times of a sequence that only Slicer has touched."""
+    """Return the times of a sequence that only Slicer has written."""
     values = next((v.split() for k, v in top.items() if re.fullmatch(r"axis \d index values", k)), [])
     try:
         times = np.array([float(v) for v in values])
@@ -272,7 +272,7 @@ def _index_values(top: Mapping[str, str], count: int) -> Floats:
 
 
 def read_pixels(file: IO[bytes], path: Path, header: Header, limit: float) -> Pixels:
-    """Pixels behind the header, or in the file that it names.
+    """Read the pixels after the header, or in the file that it names.
 
     Raises
     ------
@@ -301,7 +301,7 @@ def read_pixels(file: IO[bytes], path: Path, header: Header, limit: float) -> Pi
 
 
 def _inflated(file: IO[bytes], size: int) -> bytes:
-    """At most ``size`` bytes of a zlib or gzip stream: a bomb is not unpacked."""
+    """Inflate at most ``size`` bytes of a zlib or gzip stream, whatever its length."""
     inflater, out = zlib.decompressobj(wbits=32 + 15), bytearray()
     try:
         while len(out) < size and (block := file.read(1 << 16)):
@@ -314,16 +314,16 @@ def _inflated(file: IO[bytes], size: int) -> bytes:
 
 
 def write_header(header: Header, path: Path, image_to_reference: Floats) -> bytes:
-    """Header for raw pixels that follow it, MetaImage or NRRD by the path's ending.
+    """Write the header of raw pixels that follow it, MetaImage or NRRD by the path's suffix.
 
     Parameters
     ----------
     header : Header
-        What it shall say.
+        Its content.
     path : Path
         Name of the file.
     image_to_reference : ndarray, shape (4, 4)
-        Where the first frame lies, RAS; NRRD carries it, as LPS.
+        Position of the first frame, RAS; NRRD stores it, as LPS.
     """
     lps = np.diag([-1.0, -1.0, 1.0, 1.0]) @ image_to_reference
     frames = _frame_fields(header)

@@ -20,7 +20,7 @@ _DEEP = {"I;16": np.uint16, "I;16L": np.uint16, "I;16B": np.uint16, "I": np.int3
 _GREY = {"1", "L", "LA", "La"}
 _COLOUR = {"RGB", "RGBA", "RGBa", "RGBX", "P", "PA", "CMYK", "YCbCr"}
 _STILL_DELAY = 100
-"""ms; what browsers show for a GIF frame that declares no duration."""
+"""ms; the time for which browsers show a GIF frame that declares no duration."""
 
 
 def open_picture(path: Path, format: str, limit: float) -> Recording:
@@ -38,7 +38,7 @@ def open_picture(path: Path, format: str, limit: float) -> Recording:
     Raises
     ------
     InputError
-        If the file is damaged, too large or of a pixel type that is no picture.
+        If the file is damaged, too large or of an unsupported pixel type.
     """
     with decoding(path, format), _quiet(), _opened(path, format) as image:
         mode = image.mode
@@ -91,7 +91,7 @@ def _opened(path: Path, format: str) -> Iterator[Image.Image]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Pillow warns of large pictures (our limit decides) and of odd tags (which are not used)."""
+    """Silence Pillow's warnings of large pictures (our limit decides) and of odd tags (which are not used)."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield

@@ -1,4 +1,4 @@
-"""Spacing as a line of text, for formats that have no place for it: written and read by echospline alone."""
+"""Spacing as a line of text, for formats without a field for it: written and read by echospline alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The slow truth: channel data of scatterers by an acoustic simulator (SIMUS of PyMUST, an extra)."""
+"""The slow reference: channel data of scatterers by an acoustic simulator (SIMUS of PyMUST, an extra)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def channel_data(
     -------
     rf : ndarray, shape (samples, elements)
     array : LinearArray
-        As recorded: for `beamform.demodulate` and `beamform.delay_and_sum`.
+        With the sampling recorded, for `beamform.demodulate` and `beamform.delay_and_sum`.
 
     Raises
     ------

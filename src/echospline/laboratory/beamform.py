@@ -15,7 +15,7 @@ from echospline.scene import Complexes, Echo, Floats, RegularGrid
 
 @dataclass(frozen=True)
 class LinearArray:
-    """How channel data were recorded.
+    """Recording parameters of channel data.
 
     Parameters
     ----------
@@ -52,12 +52,12 @@ class LinearArray:
 
 
 def demodulate(rf: NDArray[np.generic], array: LinearArray, bandwidth: float = 0.4) -> Complexes:
-    """Baseband of real channel data, shape (samples, elements): shifted to zero, cut at ``bandwidth`` x frequency / 2.
+    """Demodulate real channel data, shape (samples, elements), to baseband: shifted to zero, cut at ``bandwidth`` x frequency / 2.
 
     Raises
     ------
     InputError
-        If the data are no (samples, elements) array of real numbers.
+        If the data are not a (samples, elements) array of real numbers.
     """
     if rf.ndim != 2 or np.iscomplexobj(rf):
         raise InputError(f"channel data are real numbers of shape (samples, elements); got shape {rf.shape}")
@@ -100,7 +100,7 @@ def delay_and_sum(iq: Complexes, array: LinearArray, grid: RegularGrid) -> Echo:
 
 
 def rigid_motion(points: Floats, displacement: Floats) -> tuple[Floats, float]:
-    """Rotation and translation that fit a displacement best (Kabsch): its field (n, 2) mm and the angle in radians."""
+    """Return the rotation and translation that fit a displacement best (Kabsch): its field (n, 2) mm and the angle in radians."""
     centre, moved = points.mean(axis=0), (points + displacement).mean(axis=0)
     p, q = points - centre, points + displacement - moved
     angle = float(np.arctan2((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum(), (p * q).sum()))

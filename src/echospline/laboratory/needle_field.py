@@ -19,15 +19,15 @@ class NeedleField:
     """Point forces along the needle, strongest at the tip (regularised Kelvin solution), still at the edges.
 
     The field is shifted by its mean along the border and brought to zero there by a squared sine over
-    ``rim`` of the width, so that the picture's edges stay. Neither mechanics nor image take part: it is the
-    independent truth that phantoms are moved by.
+    ``rim`` of the width, so that the picture's edges stay. It depends on no tissue model and no image: it is the
+    independent truth that moves phantoms.
 
     Parameters
     ----------
     grid : RegularGrid
         The region; the largest displacement over it is ``peak``.
     pose : NeedlePose
-        Where the needle is.
+        Pose of the needle.
     peak : float
         mm.
     friction : float
@@ -61,7 +61,7 @@ class NeedleField:
         object.__setattr__(self, "_scale", self.peak / largest)
 
     def __call__(self, points: Floats) -> Floats:
-        """Displacement at points (n, 2) mm, mm."""
+        """Return the displacement at points (n, 2) mm, mm."""
         out = np.empty((len(points), 2))
         for start in range(0, len(points), BLOCK):
             p = points[start : start + BLOCK]

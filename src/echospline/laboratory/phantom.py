@@ -46,7 +46,7 @@ class Inclusion:
         _check_level(self.level)
 
     def contains(self, points: Floats) -> NDArray[np.bool_]:
-        """Which points lie inside, shape (n,)."""
+        """Test which points lie inside, shape (n,)."""
         inside: NDArray[np.bool_] = ((points - self.centre) ** 2 / np.square(self.half_axes)).sum(
             axis=1
         ) <= 1.0
@@ -69,7 +69,7 @@ class Layer:
         _check_level(self.level)
 
     def contains(self, points: Floats) -> NDArray[np.bool_]:
-        """Which points lie inside, shape (n,)."""
+        """Test which points lie inside, shape (n,)."""
         inside: NDArray[np.bool_] = (points[:, 1] >= self.top) & (points[:, 1] < self.bottom)
         return inside
 
@@ -100,7 +100,7 @@ class Scatterers:
             )
         rng = np.random.default_rng(seed)
         positions = rng.uniform((x0, y0), (x1, y1), (n, 2))
-        # equal strengths: at the same number per cell their speckle is more developed than that of random ones
+        # equal amplitudes: at the same number per cell, their speckle is more developed than with random ones
         amplitudes = rng.choice((-1.0, 1.0), n)
         level = np.zeros(n)
         for region in regions:
@@ -108,7 +108,7 @@ class Scatterers:
         return cls(positions, amplitudes * 10.0 ** (level / 20.0), density)
 
     def replaced(self, share: float, seed: int) -> Scatterers:
-        """Return the set with a share (0 to 1) of amplitudes drawn anew: what moved out of the imaging plane."""
+        """Return the set with a share (0 to 1) of amplitudes drawn again: those that moved out of the imaging plane."""
         if not 0.0 <= share <= 1.0:
             raise InputError(f"the share of replaced scatterers lies between 0 and 1; got {share}")
         rng = np.random.default_rng(seed)
@@ -189,7 +189,7 @@ class Phantom:
         return RegularGrid(shape, (dx, dy), (x0 - mx * dx, y0 - my * dy))
 
     def moved(self, displacement: Displacement | None) -> Floats:
-        """Positions of the scatterers after ``displacement``, mm; beyond the picture its edge's value goes on."""
+        """Move the scatterers by ``displacement``, mm; beyond the picture the value at its edge continues."""
         positions = self.scatterers.positions
         if displacement is None:
             return positions
@@ -237,7 +237,7 @@ class Phantom:
         steering: float = 0.0,
         scatterers: Scatterers | None = None,
     ) -> Echo:
-        """As `form`, with the scatterers at given positions (n, 2) mm: several looks share one motion."""
+        """Form as `form` does with the scatterers at given positions (n, 2) mm, so that several angles share one motion."""
         scatterers = scatterers or self.scatterers
         p, lattice = positions, self.lattice
         k, theta = self.probe.carrier, np.radians(steering)
@@ -261,7 +261,7 @@ class Phantom:
         return Echo(np.asarray(iq, dtype=np.complex64), self.samples, self.probe.carrier)
 
     def exact(self, points: Floats, displacement: Displacement | None = None) -> Complexes:
-        """Sum over all scatterers at points (n, 2) mm, without noise: the slow truth, shape (n,) complex."""
+        """Sum over all scatterers at points (n, 2) mm without noise: the slow reference, shape (n,) complex."""
         p, a = self.moved(displacement), self.scatterers.amplitudes
         out = np.empty(len(points), dtype=np.complex128)
         sy, k = self.probe.sigma_axial, self.probe.carrier
@@ -276,7 +276,7 @@ class Phantom:
         return out * gain
 
     def noise(self, seed: int) -> Complexes:
-        """Electronic noise of one frame, shape of the samples, at the level that ``probe.snr`` asks for."""
+        """Draw the electronic noise of one frame, shape of the samples, at the level of ``probe.snr``."""
         shape = self.samples.shape[::-1]
         rng = np.random.default_rng((seed, 7919))
         # white noise of RF lines spreads over sampling / 2; the baseband samples carry c / (2 dy) of it
@@ -289,7 +289,7 @@ class Phantom:
 
     @cached_property
     def _gain(self) -> Floats:
-        """Makes the mean power of 0 dB speckle 1: density times the integral of the squared point spread."""
+        """Scale the mean power of 0 dB speckle to 1: density times the integral of the squared point spread."""
         dx, dy = self.lattice.spacing
         beam = self.probe.beam(self.samples.y)
         power = self.scatterers.density * (dx * dy) ** 2 / (4.0 * pi * beam * self.probe.sigma_axial)
@@ -305,7 +305,7 @@ def deposit(
     Parameters
     ----------
     points : ndarray, shape (n, 2)
-        mm; those outside the grid fall away.
+        mm; those outside the grid are dropped.
     amplitudes : ndarray, shape (n,)
     grid : RegularGrid
     wave : (float, float)
@@ -337,7 +337,7 @@ def _deposit(points: Any, amplitudes: Any, origin: Any, spacing: Any, wave: Any,
             continue
         ix, iy = int(gx), int(gy)
         fx, fy = gx - ix, gy - iy
-        # whole turns go first: the cosine of a small angle is the faster one
+        # whole turns are removed first: the cosine of a small angle is faster
         turns = wave[0] * x + wave[1] * y
         angle = 2.0 * pi * (turns - np.floor(turns))
         re, im = amplitudes[i] * np.cos(angle), -amplitudes[i] * np.sin(angle)

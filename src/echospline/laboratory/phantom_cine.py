@@ -13,7 +13,7 @@ from echospline.scene import Display, Echo, Floats, UltrasoundImage
 
 
 def displacement_of(deformation: Deformation) -> Displacement:
-    """Displacement at any points in mm; beyond the mesh that of its edge."""
+    """Return a function for the displacement at any points in mm; beyond the mesh, that of its edge."""
     x0, x1, y0, y1 = deformation.grid.extent
 
     def displacement(points: Floats) -> Floats:
@@ -38,13 +38,13 @@ def phantom_pictures(
     phantom : Phantom
         The tissue; its seed also gives every frame's noise.
     display : Display, optional
-        How echoes become grey.
+        Log compression of the echoes.
     fps : float
         Frames per second, which turns ``out_of_plane`` into a share per frame.
     out_of_plane : float
         Share of the scatterers that leave the imaging plane per second, 0 to 1.
     record : callable, optional
-        Told every frame's index and echoes.
+        Called with every frame's index and echoes.
 
     Raises
     ------
@@ -60,7 +60,7 @@ def phantom_pictures(
     def form(deformation: Deformation, inverse: InverseMap) -> UltrasoundImage:
         nonlocal index
         kept = (1.0 - out_of_plane) ** (index / fps)
-        # one seed for the whole run: the same scatterers leave, ever more of them
+        # one seed for the whole run: the set of scatterers that have left only grows
         scatterers = phantom.scatterers.replaced(1.0 - kept, phantom.seed + 1)
         echo = phantom.formed_at(
             phantom.moved(displacement_of(deformation)),

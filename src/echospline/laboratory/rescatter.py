@@ -1,4 +1,4 @@
-"""The image model that re-forms speckle: scatterers of the image's own brightness move, and are imaged anew.
+"""The image model that forms speckle again: scatterers of the image's own brightness move and are imaged in every frame.
 
 `warp` moves the picture's grey values, so speckle stretches like a photograph and never decorrelates. Here the
 picture gives only its echogenicity, the local mean power of its envelope; scatterers of that strength move with the
@@ -20,13 +20,13 @@ from echospline.picture import Deformation, ImageFormer, InverseMap
 from echospline.scene import FWHM, Display, Echo, Floats, Transducer, UltrasoundImage
 
 FINE = Transducer(frequency=7.5, snr=30.0)
-"""A linear array for superficial tissue, the kind that took the image that ships with the package."""
+"""A linear array for superficial tissue, like the one that recorded the image that ships with the package."""
 
 
 def echogenicity(
     image: UltrasoundImage, probe: Transducer, display: Display, smoothing: float = 1.0
 ) -> Floats:
-    """Level of the tissue at every pixel, dB: mean power of the envelope over ``smoothing`` resolution cells."""
+    """Return the level of the tissue at every pixel, dB: mean power of the envelope over ``smoothing`` resolution cells."""
     grey = np.asarray(image.pixels, dtype=np.float64)
     if grey.ndim == 3:
         grey = grey.mean(axis=2)
@@ -49,7 +49,7 @@ def echogenicity(
 def rescattered(
     image: UltrasoundImage, probe: Transducer, *, display: Display | None = None, seed: int = 0
 ) -> tuple[Phantom, Display]:
-    """Phantom whose scatterers are as bright as the image, and the display that shows them alike."""
+    """Build a phantom whose scatterers are as bright as the image, and the display that shows them equally bright."""
     display = display or Display()
     level = echogenicity(image, probe, display)
     # the probe's snr is against speckle of 0 dB: make that the image's mean power
@@ -89,7 +89,7 @@ def rescatter(
     probe : Transducer
         Gives speckle size and noise.
     display : Display, optional
-        How the image was log-compressed; 60 dB when not given.
+        Log compression of the image; 60 dB when not given.
     angles : sequence of float
         Beams in degrees whose envelopes are averaged, as scanners do; one angle leaves the full contrast of
         speckle, and costs a third.

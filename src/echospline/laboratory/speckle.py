@@ -1,4 +1,4 @@
-"""Statistics of speckle: what tells a real pattern from a stretched photograph."""
+"""Statistics of speckle that distinguish a real pattern from a stretched photograph."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class SpeckleStatistics:
 
 
 def speckle_statistics(envelope: NDArray[np.generic], spacing: tuple[float, float]) -> SpeckleStatistics:
-    """Statistics of a homogeneous piece of envelope, shape (rows, columns), spacing (lateral, depth) in mm.
+    """Compute statistics of a homogeneous piece of envelope, shape (rows, columns), spacing (lateral, depth) in mm.
 
     Raises
     ------
@@ -55,12 +55,12 @@ def speckle_statistics(envelope: NDArray[np.generic], spacing: tuple[float, floa
 
 
 def correlation_coefficient(a: NDArray[np.generic], b: NDArray[np.generic]) -> float:
-    """Pearson's correlation of two pieces of one size."""
+    """Compute Pearson's correlation of two pieces of one size."""
     return float(np.corrcoef(np.ravel(a).astype(float), np.ravel(b).astype(float))[0, 1])
 
 
 def _autocovariance(e: Floats) -> Floats:
-    """Autocovariance at non-negative lags, 1 at lag 0; padded, so nothing wraps around."""
+    """Compute the autocovariance at non-negative lags, 1 at lag 0; padded, so that nothing wraps around."""
     rows, columns = e.shape
     spectrum = fft.rfft2(e - e.mean(), s=(2 * rows, 2 * columns))
     total = fft.irfft2(np.abs(spectrum) ** 2, s=(2 * rows, 2 * columns))[:rows, :columns]
@@ -69,7 +69,7 @@ def _autocovariance(e: Floats) -> Floats:
 
 
 def _width(profile: Floats, spacing: float) -> float:
-    """Full width at half maximum of a peak at lag 0, interpolated between samples."""
+    """Return the full width at half maximum of a peak at lag 0, interpolated between samples."""
     below = np.flatnonzero(profile < 0.5)
     if len(below) == 0:
         return float("inf")

@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 AnyModel = TissueModel[Any]
 ModelFactory = Callable[[str], AnyModel]
-"""Turns a model's name into a model; the outside gets it passed in and never imports a model itself."""
+"""Builds the model of a name; passed in, so that the live loop and the front ends import no model."""
 
 
 PAUSE = 0.5
@@ -36,7 +36,7 @@ PAUSE = 0.5
 
 @dataclass
 class _Requests:
-    """What was asked for since the last step: the newest of each kind."""
+    """Requests since the last step, the newest of each kind."""
 
     command: Command | None = None
     place: NeedlePose | None = None
@@ -51,16 +51,16 @@ class _Requests:
 class LiveEngine:
     """One trainee's tissue and needle.
 
-    `step` advances it by one period; who calls it (a `Pacer`'s thread, a test) decides the clock. All
+    `step` advances it by one period; its caller (a `Pacer`'s thread, a test) sets the clock. All
     other methods may be called from any thread; they take effect at the next step, the newest of a kind
-    winning. A model that raises stops the engine, not the program: the snapshot says why, until a reset.
+    winning. A model that raises stops the engine, not the program: the snapshots carry the reason until a reset.
 
     Parameters
     ----------
     models : callable
         Model factory.
     name : str
-        The model to begin with.
+        The first model.
     home : NeedlePose
         Where the needle begins and where `reset` takes it; usually of zero depth.
     rate : float
@@ -122,7 +122,7 @@ class LiveEngine:
     def command(
         self, entry: tuple[float, float], tip: tuple[float, float], number: int = 0, sent: float = 0.0
     ) -> None:
-        """Say where the needle shall go, mm; the newest command wins.
+        """Set the needle's goal, mm; the newest command wins.
 
         Raises
         ------
@@ -134,7 +134,7 @@ class LiveEngine:
             self._requests.command = Command(entry, tip, number, sent)
 
     def place(self, entry: tuple[float, float], tip: tuple[float, float]) -> None:
-        """Put the needle here as if it had gone straight to this pose, mm: a tracker first sees it inserted.
+        """Put the needle here as if it had gone straight to this pose, mm: for a needle that is already inserted when tracking begins.
 
         Raises
         ------
@@ -146,7 +146,7 @@ class LiveEngine:
             self._requests.place, self._requests.command = pose, Command(entry, tip)
 
     def reset(self) -> None:
-        """Take the needle home and the tissue to rest; also ends a replay and a failure."""
+        """Move the needle home and the tissue to rest; also end a replay and a failure."""
         with self._lock:
             asked = self._requests
             self._requests = _Requests(
@@ -154,33 +154,33 @@ class LiveEngine:
             )
 
     def freeze(self, on: bool) -> None:
-        """Let time stand still, or run again."""
+        """Stop model time, or let it run again."""
         with self._lock:
             self._requests.frozen = on
 
     def switch(self, name: str) -> None:
-        """Change the model and keep the pose; the new model's needle went there straight."""
+        """Change the model and keep the pose; the new model starts from a straight insertion to it."""
         with self._lock:
             self._requests.model = name
 
     def compare(self, name: str | None) -> None:
-        """Step a second model in the same pose, so that their difference can be shown; None ends it."""
+        """Step a second model in the same pose, so that their difference can be shown; None stops it."""
         with self._lock:
             self._requests.compare = (name,)
 
     def watch(self, points: ArrayLike) -> None:
-        """Report where these reference points, shape (k, 2) mm, move to."""
+        """Report the deformed positions of these reference points, shape (k, 2) mm, in every snapshot."""
         checked = np.empty((0, 2)) if np.size(points) == 0 else as_points(points, "watched points")
         with self._lock:
             self._requests.watch = checked
 
     def replay(self, poses: Iterable[NeedlePose]) -> None:
-        """Take the needle home and the tissue to rest, then one recorded pose per step instead of commands."""
+        """Move the needle home and the tissue to rest, then use one recorded pose per step instead of commands."""
         with self._lock:
             self._requests.replay = deque(poses)
 
     def observe(self, callback: Callable[[Snapshot], None]) -> None:
-        """Call ``callback`` with every snapshot, in the stepping thread (a recorder misses no step)."""
+        """Call ``callback`` with every snapshot, in the stepping thread (so that a recorder misses no step)."""
         with self._lock:
             self._observers = [*self._observers, callback]
 
@@ -201,11 +201,11 @@ class LiveEngine:
                 self._advance()
             self._steps += 1
             snapshot = self._snapshot(time.perf_counter() - started)
-        except Exception as error:  # a model may fail in any way; the server and its other clients live on
+        except Exception as error:  # a model may fail in any way; the server and its other clients go on
             log.exception("the model %s failed", self._name)
             self._failure = f"{type(error).__name__}: {error}"
             last = self.snapshots.latest()
-            assert last is not None  # the constructor put one
+            assert last is not None  # the constructor puts one
             snapshot = replace(
                 last.value,
                 step=self._steps,
@@ -279,7 +279,7 @@ class LiveEngine:
             raise ArithmeticError("the displacement is not finite")
         offered = getattr(self._model, "spline", None)
         watched = self._watch
-        if len(watched):  # as the picture shows them: bilinear between nodes
+        if len(watched):  # bilinear between nodes, as in the picture
             watched = Deformation(self._model.grid, displacement).forward(watched)
         return Snapshot(
             step=self._steps,

@@ -1,4 +1,4 @@
-"""Motion of a needle: along its commands, and straight to a pose."""
+"""Motion of a needle: following its commands, and straight to a pose."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from echospline.mechanics.protocol import TissueModel
 from echospline.scene import ZERO_LENGTH, NeedlePose
 
 ARRIVED = 1e-4
-"""mm; a needle that comes this near to where it is commanded is put exactly there."""
+"""mm; a needle this near to its goal is put exactly there."""
 
 
 def follow(pose: NeedlePose, command: Command, dt: float, lag: float, fastest: float) -> NeedlePose:
     """Move the needle towards its command as a hand does, without jumps.
 
-    Commands come at the rate of a screen or a tracker, steps at another; taken as they come, the speed of (15)
-    would flicker between zero and a multiple of the true one. A first-order lag smooths it.
+    Commands come at the rate of a screen or a tracker, steps at another; applied directly, they would make the speed of (15)
+    flicker between zero and a multiple of the true one. A first-order lag smooths it.
 
     Parameters
     ----------
     pose : NeedlePose
         Before the step.
     command : Command
-        Where to go.
+        The needle's goal.
     dt : float
         Length of the step, s.
     lag : float
@@ -66,14 +66,14 @@ def _towards(
 def insert_straight(
     model: TissueModel[Any], pose: NeedlePose, speed: float = 10.0, stride: float = 0.5
 ) -> object:
-    """State of a model whose needle went straight to a pose: what a model switched to starts from.
+    """Return the state of a model after a straight insertion to a pose: the first state after a switch of models.
 
     Parameters
     ----------
     model : TissueModel
-        Any.
+        Any model.
     pose : NeedlePose
-        Where the needle is.
+        Pose of the needle.
     speed : float
         Of the insertion, mm/s.
     stride : float

@@ -10,7 +10,7 @@ from echospline.live.engine import LiveEngine
 
 
 class Metronome:
-    """Says when the next step is due; time lost beyond a few periods is given up, not made up in a burst.
+    """Computes when the next step is due; time lost beyond a few periods is given up, not made up in a burst.
 
     Parameters
     ----------
@@ -29,7 +29,7 @@ class Metronome:
         self._due = now
 
     def wait(self, now: float) -> float:
-        """Seconds to sleep until the next step, 0 if it is due; each call counts one step."""
+        """Return the seconds to sleep until the next step, 0 if it is due; each call counts one step."""
         self._due += self.period
         behind = (now - self._due) / self.period
         if behind > self.slack:
@@ -58,7 +58,7 @@ class Pacer:
         return self._thread.is_alive()
 
     def start(self) -> None:
-        """Begin to step."""
+        """Start to step the engine."""
         self._metronome = Metronome(self.engine.period, self._clock())
         self._thread.start()
 

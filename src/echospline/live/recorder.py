@@ -60,7 +60,7 @@ class Trace:
         return depth
 
     def pose(self, row: int) -> NeedlePose:
-        """One pose."""
+        """Return one pose."""
         x, y, tx, ty, speed = (float(v) for v in self.poses[row])
         return NeedlePose((x, y), (tx, ty), speed)
 
@@ -74,12 +74,12 @@ class Trace:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Trace:
-        """Read what `to_bytes` wrote; sizes are checked before anything is unpacked.
+        """Read what `to_bytes` wrote; sizes are checked before anything is decompressed.
 
         Raises
         ------
         InputError
-            If the bytes are something else.
+            If the bytes are not a trace.
         """
         if len(data) < 24:
             raise InputError("a stored trace is cut short")
@@ -103,7 +103,7 @@ class Trace:
 class Recorder:
     """Collects the rows of a `Trace`; observe an engine with it.
 
-    A reset of the engine begins the recording anew, and frozen time is not recorded. It ends by itself
+    A reset of the engine starts a new recording, and frozen time is not recorded. The recording ends
     after ``longest`` seconds.
     """
 
@@ -115,7 +115,7 @@ class Recorder:
         self._watched: list[Floats] = []
 
     def __call__(self, snapshot: Snapshot) -> None:
-        """Take one snapshot."""
+        """Record one snapshot."""
         if snapshot.time < self._time:
             self._rows, self._watched = [], []
         moved, self._time = snapshot.time != self._time, snapshot.time
@@ -135,7 +135,7 @@ class Recorder:
         return self.period * len(self._rows)
 
     def trace(self) -> Trace:
-        """Return what was recorded so far."""
+        """Return the recording so far."""
         if not self._rows:
             return Trace(self.period, np.empty((0, 5)), np.empty((0, 1, 2)))
         count = min(len(self._rows), len(self._watched))

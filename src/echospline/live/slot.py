@@ -10,14 +10,14 @@ T = TypeVar("T")
 
 
 class Numbered(NamedTuple, Generic[T]):
-    """A value beside its number in the order of arrival, the first being 1."""
+    """A value with its number in the order of arrival, the first being 1."""
 
     number: int
     value: T
 
 
 class Slot(Generic[T]):
-    """Holds the newest value and nothing else: a slow reader misses values, and never gets old ones.
+    """Holds the newest value alone: a slow reader misses values and never gets old ones.
 
     Every method may be called from any thread.
     """
@@ -52,8 +52,8 @@ class Slot(Generic[T]):
     def call_when_newer(self, than: int, callback: Callable[[], None]) -> None:
         """Call ``callback`` once, as soon as there is a value with a number above ``than``.
 
-        It runs in the thread that puts the value (or in this one, if the value is here already): keep it
-        short. This is how an event loop waits without a thread of its own.
+        It runs in the thread that puts the value (or in this one, if the value is already present): keep it
+        short. An event loop can wait in this way without a thread of its own.
         """
         with self._changed:
             here = self._is_newer(than)

@@ -10,16 +10,16 @@ from echospline.scene import Floats, NeedlePose
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """Where the needle shall go.
+    """Goal of the needle.
 
     Parameters
     ----------
     entry, tip : (x, y)
         n_s and n_t, mm.
     number : int
-        Chosen by the sender and returned in every snapshot that this command has reached.
+        Chosen by the sender and returned in every snapshot from this command on.
     sent : float
-        The sender's clock, returned as it came (for latency).
+        The sender's clock, returned unchanged (for latency).
     """
 
     entry: tuple[float, float]
@@ -43,24 +43,24 @@ class Snapshot:
     displacement : ndarray, shape (n, 2)
         Of the mesh nodes, mm.
     model : str
-        Name of the model that answered.
+        Name of the model.
     command : Command
-        The newest command that this step has taken.
+        The newest command applied in this step.
     duration : float
-        What the step took, s.
+        Processing time of the step, s.
     watched : ndarray, shape (k, 2)
         Deformed positions of the watched points, mm.
     reference : ndarray, shape (n, 2), or None
         Displacement by the model compared with, in the same pose, mm.
     frozen : bool
-        Whether time stands still.
+        Whether model time is stopped.
     replaying : bool
         Whether the pose comes from a recording.
     failure : str or None
-        What ended the model, if something did; a reset starts it again.
+        The error that stopped the model, if any; a reset starts it again.
     spline : callable or None
         Returns the field as a spline (landmarks, weights, motion, centre, scale, kernel), or None where nothing is
-        displaced; there if the model offers it. It may cost as much as a step: call it when it is needed.
+        displaced; present if the model offers it. It may cost as much as a step: call it only when needed.
     """
 
     step: int

@@ -1,4 +1,4 @@
-"""IMAGE: pixels beside the matrix that lays them in space; the protocol's position is the image *centre*."""
+"""IMAGE: pixels with the matrix that places them in space; the protocol's position is the image *centre*."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Image:
         return columns, rows, slices
 
     def pack(self) -> bytes:
-        """72 bytes of header and the voxels, little-endian, first axis (columns) fastest."""
+        """Pack 72 bytes of header and the voxels, little-endian, first axis (columns) fastest."""
         v = self.voxels
         code = scalar_code(v, "an IMAGE")
         if SCALARS[code] == "c16":
@@ -66,12 +66,12 @@ class Image:
 
     @classmethod
     def unpack(cls, content: memoryview) -> Image:
-        """Image of the bytes; LPS becomes RAS.
+        """Unpack an image; LPS becomes RAS.
 
         Raises
         ------
         ProtocolError
-            If the sizes do not fit the bytes, or the message brings a part of a volume only.
+            If the sizes do not fit the bytes, or the message holds only a part of a volume.
         """
         if len(content) < _HEAD.size:
             raise ProtocolError(f"an IMAGE has 72 bytes of header; got {len(content)} bytes")
@@ -103,5 +103,5 @@ class Image:
 
 
 def centre(size: tuple[int, int, int]) -> Floats:
-    """Homogeneous index (column, row, slice, 1) of the middle of an image of ``size`` voxels."""
+    """Return the homogeneous index (column, row, slice, 1) of the middle of an image of ``size`` voxels."""
     return np.array([(n - 1) / 2 for n in size] + [1.0])

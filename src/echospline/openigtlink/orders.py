@@ -20,12 +20,12 @@ NAMES = {
     "start": "start", "stop": "stop", "reset": "reset", "freeze": "freeze", "unfreeze": "unfreeze",
     "load": "load", "loadscenario": "load", "model": "model", "switchmodel": "model",
 }  # fmt: skip
-"""Orders that are understood, by their name in small letters."""
+"""Orders by their name in small letters."""
 
 
 @dataclass(frozen=True)
 class Order:
-    """What a peer wants done.
+    """An order of a peer.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ class Order:
 
 
 def order_of(message: Message) -> Order | None:
-    """Order in a STRING or COMMAND, None if it is no order but some other text.
+    """Return the order in a STRING or COMMAND; None if the text is no order.
 
     A text is an order if it is XML ``<Command Name="..." .../>``, if its device says so (``CMD_...``, ``Command``),
     or if it comes as COMMAND.
@@ -48,7 +48,7 @@ def order_of(message: Message) -> Order | None:
     Raises
     ------
     InputError
-        If it is an order that cannot be understood.
+        If it is an unknown or malformed order.
     """
     content = message.content
     if isinstance(content, CommandReply):
@@ -123,7 +123,7 @@ def carry_out(order: Order, stage: Stage) -> str:
 
 
 def answer(message: Message, text: str, *, done: bool) -> Message:
-    """Tell the peer what became of its order, in the form in which it asked.
+    """Build the answer to an order, in the form of the order.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def answer(message: Message, text: str, *, done: bool) -> Message:
         The order: STRING of device ``CMD_id`` is answered by STRING ``ACK_id``, COMMAND by RTS_COMMAND, other
         STRING by STATUS.
     text : str
-        What happened.
+        The result.
     done : bool
         Whether the order was carried out.
     """

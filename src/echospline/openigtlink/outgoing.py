@@ -1,4 +1,4 @@
-"""What goes out for one state of the scene: the deformed picture, the needle, the targets, the mesh, as messages."""
+"""Messages of one state of the scene: the deformed picture, the needle, the targets and the mesh."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from echospline.picture import Deformation, NeedleEcho, draw_needle, warp
 from echospline.scene import ImagingPlane, Pixels, RegularGrid, UltrasoundImage, Visible
 
 ORIENTATION = {"UltrasoundImageOrientation": "MF"}
-"""Said in the metadata of every image: columns grow to the marked side of the probe, rows away from it."""
+"""Metadata of every image: columns grow to the marked side of the probe, rows away from it."""
 
 
 @dataclass(frozen=True)
 class Looks:
-    """How the scene is told.
+    """Naming and looks of the scene in messages.
 
     Parameters
     ----------
     naming : Naming
         Names of frames.
     embed : bool
-        Whether the image carries its place in the reference frame (as PLUS' EmbeddedTransformToFrame does); else it
-        comes in pixels, with a transform ``ImageToReference`` beside it.
+        Whether the image carries its place in the reference frame (as with PLUS' EmbeddedTransformToFrame); otherwise
+        it is in pixels, and a transform ``ImageToReference`` is sent with it.
     echo : NeedleEcho or None
         The needle's looks; None leaves it out of the picture.
     """
@@ -42,7 +42,7 @@ class Looks:
 def draw(
     image: UltrasoundImage, grid: RegularGrid, snapshot: Snapshot, visible: Visible | None, looks: Looks
 ) -> Pixels:
-    """Deformed pixels with what the beam sees of the needle.
+    """Draw the deformed pixels with the part of the needle inside the beam.
 
     Parameters
     ----------
@@ -71,16 +71,16 @@ def draw(
 def image_message(
     pixels: Pixels, grid: RegularGrid, plane: ImagingPlane, looks: Looks, now: float
 ) -> list[Message]:
-    """IMAGE, and its transform where it is not embedded.
+    """Build IMAGE, and its transform where it is not embedded.
 
     Parameters
     ----------
     pixels : ndarray
         (rows, columns) or (rows, columns, 3).
     grid : RegularGrid
-        Their places in mm.
+        Their positions in mm.
     plane : ImagingPlane
-        Where they lie.
+        Their plane.
     looks : Looks
         How it is told.
     now : float
@@ -95,14 +95,14 @@ def image_message(
 
 
 def needle_message(snapshot: Snapshot, plane: ImagingPlane, naming: Naming, now: float) -> Message:
-    """TRANSFORM of the needle in the picture."""
+    """Build TRANSFORM of the needle in the picture."""
     return Message(
         Transform(plane.tip_matrix(snapshot.pose)), f"{naming.needles[0]}To{naming.reference}", now
     )
 
 
 def target_message(snapshot: Snapshot, plane: ImagingPlane, naming: Naming, now: float) -> Message | None:
-    """POINT of the watched points where the tissue has carried them; None if none are watched."""
+    """Build POINT of the watched points at their deformed positions; None if none are watched."""
     if not len(snapshot.watched):
         return None
     places = plane.lift(snapshot.watched)
@@ -115,7 +115,7 @@ def target_message(snapshot: Snapshot, plane: ImagingPlane, naming: Naming, now:
 
 
 def mesh_message(snapshot: Snapshot, grid: RegularGrid, plane: ImagingPlane, now: float) -> Message:
-    """POLYDATA of the displaced mesh; each node carries its displacement vector, mm, in the reference frame."""
+    """Build POLYDATA of the displaced mesh; each node carries its displacement vector, mm, in the reference frame."""
     nx, ny = grid.shape
     first = (np.arange(ny - 1)[:, None] * nx + np.arange(nx - 1)).ravel()
     quads = np.column_stack((first, first + 1, first + 1 + nx, first + nx))

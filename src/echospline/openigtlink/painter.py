@@ -68,7 +68,7 @@ class Painter:
         return messages
 
     def _visible(self, stage: Stage, needle: TrackedNeedle | None) -> Visible | None:
-        """A needle that nobody tracks (a planned insertion, a page) lies in the plane."""
+        """Return the visible piece; a needle without a tracker (a planned insertion, a page) lies in the plane."""
         if needle is None:
             return Visible(0.0, self.reach.shaft, 1.0)
         return needle.seen(stage.image.grid.extent[2], self.reach)

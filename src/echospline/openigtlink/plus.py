@@ -15,7 +15,7 @@ LARGEST = 2**20
 
 
 def read_calibration(path: str | Path) -> dict[str, Floats]:
-    """Fixed transforms of a PLUS device set file (``PlusDeviceSet_....xml``).
+    """Read the fixed transforms of a PLUS device set file (``PlusDeviceSet_....xml``).
 
     Raises
     ------

@@ -41,7 +41,7 @@ class Points:
     points: tuple[Point, ...]
 
     def pack(self) -> bytes:
-        """136 bytes each."""
+        """Pack 136 bytes for each."""
         return b"".join(
             _POINT.pack(
                 pack_name(p.name, 64, "point name"),
@@ -56,7 +56,7 @@ class Points:
 
     @classmethod
     def unpack(cls, content: memoryview) -> Points:
-        """Fiducials of the bytes."""
+        """Unpack fiducials."""
         if len(content) % _POINT.size:
             raise ProtocolError(f"a POINT has a multiple of 136 bytes; got {len(content)}")
         points = []
@@ -88,7 +88,7 @@ class PolyData:
     vertices, lines, polygons, strips : tuple of tuple of int, or ndarray of int, shape (cells, corners)
         Cells by the indices of their points.
     attributes : tuple of Attribute
-        What is known at points or cells, such as the displacement.
+        Values at points or cells, such as the displacement.
     """
 
     TYPE: ClassVar[str] = "POLYDATA"
@@ -100,7 +100,7 @@ class PolyData:
     attributes: tuple[Attribute, ...] = field(default=())
 
     def pack(self) -> bytes:
-        """Counts, points, cells, attributes."""
+        """Pack counts, points, cells and attributes."""
         p = np.asarray(self.points)
         if p.ndim != 2 or p.shape[1] != 3:
             raise InputError(f"the points of a POLYDATA have shape (n, 3); got {p.shape}")
@@ -112,7 +112,7 @@ class PolyData:
             names.append(pack_name(a.name, 255, "attribute name") + b"\0")
             numbers.append(a.values.astype(">f4").tobytes())
         all_names = b"".join(names)
-        if len(all_names) % 2:  # the protocol keeps what follows on an even byte
+        if len(all_names) % 2:  # the protocol aligns the next part to an even byte
             all_names += b"\0"
         return b"".join(
             (
@@ -127,7 +127,7 @@ class PolyData:
 
     @classmethod
     def unpack(cls, content: memoryview) -> PolyData:
-        """Mesh of the bytes."""
+        """Unpack a mesh."""
         if len(content) < _POLYDATA.size:
             raise ProtocolError(f"a POLYDATA has 40 bytes of header; got {len(content)} bytes")
         n, *cells, attributes = _POLYDATA.unpack_from(content)

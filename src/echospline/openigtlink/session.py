@@ -1,4 +1,4 @@
-"""The session: a tracker drives the needle of a live engine, and its peers see the tissue that answers."""
+"""A session: a tracker moves the needle of a live engine, and its peers receive the deformed picture."""
 
 from __future__ import annotations
 
@@ -28,26 +28,26 @@ from echospline.scene import NeedlePose
 log = logging.getLogger("echospline.openigtlink")
 
 ARRIVES = 1.0
-"""mm; a needle first seen deeper than this is put there rather than thrust there."""
+"""mm; a needle that is first tracked deeper than this is placed there instead of pushed there."""
 
 
 class Session:
-    """Runs a link and a stage together; use it as a context.
+    """Runs a link and a stage; use it as a context.
 
-    Three threads work beside the caller's: the engine steps, the link talks, and one draws pictures; each gives
-    the next only its newest, so that none waits for another.
+    Three threads work beside the caller's: the engine steps, the link sends and receives, and one draws pictures; each
+    passes only its newest result on, so that none waits for another.
 
     Parameters
     ----------
     stage : Stage
-        What is simulated.
+        The simulated scene.
     options : SessionOptions
-        How.
+        Options of link and pictures.
     load : callable, optional
-        Makes a stage of the name that a LoadScenario order gives; without it such orders are refused.
+        Builds the stage of the name in a LoadScenario order; without it such orders are refused.
     moved : callable, optional
-        Called with the pose whenever the tracker moves the needle, and whether it has just come into sight (a page
-        beside it follows).
+        Called with the pose whenever the tracker moves the needle, and whether tracking of it has just begun (a page
+        follows it).
     """
 
     def __init__(
@@ -59,7 +59,7 @@ class Session:
     ) -> None:
         self.options = options or SessionOptions()
         self.port = 0
-        """Port that was had, once the context is entered."""
+        """Port actually bound, once the context is entered."""
         self._load, self._moved = load, moved
         self._stop = threading.Event()
         self._ready = threading.Event()
@@ -103,7 +103,7 @@ class Session:
         self._pacer.stop()
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait until the session ends; whether it did."""
+        """Wait until the session ends; returns whether it did."""
         return self._stop.wait(timeout)
 
     @property
@@ -174,7 +174,7 @@ class Session:
         self._loop.call_later(max(0.0, pause), self._follow)
 
     def _follow(self) -> None:
-        assert self._loop is not None  # it calls us
+        assert self._loop is not None  # it calls this method
         self._following, self._followed = False, self._loop.time()
         before, self._located = self._located, self._tracking.locate()
         if self._located.trouble != before.trouble and self._located.trouble:
@@ -183,7 +183,7 @@ class Session:
         if needle is None:
             return
         engine, pose = self._stage.engine, needle.pose(self._stage.image.grid, self.options.reach)
-        # A needle that comes into sight already inserted was not thrust there in this instant.
+        # A needle that is inserted when tracking begins was not pushed there in this step.
         appears, self._away = self._away and pose is not None and pose.depth > ARRIVES, pose is None
         pose = pose or engine.home
         (engine.place if appears else engine.command)(pose.entry, pose.tip)
@@ -211,7 +211,7 @@ class Session:
         except EchosplineError as error:
             peer.answer(answer(message, str(error), done=False))
             return
-        except Exception as error:  # a scenario may fail in any way; the link and its peers live on
+        except Exception as error:  # a scenario may fail in any way; the link and its peers go on
             log.exception("loading %s failed", name)
             peer.answer(answer(message, f"{name} failed: {type(error).__name__}: {error}", done=False))
             return
@@ -241,5 +241,5 @@ class Session:
                 return
             try:
                 self._loop.call_soon_threadsafe(self._publish, messages)
-            except RuntimeError:  # closed since we looked
+            except RuntimeError:  # closed since the check above
                 return

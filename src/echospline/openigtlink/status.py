@@ -1,4 +1,4 @@
-"""The status of a session in one sentence: model, needle, and what is wrong."""
+"""The status of a session in one sentence: model, needle and faults."""
 
 from __future__ import annotations
 

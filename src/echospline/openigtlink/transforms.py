@@ -1,4 +1,4 @@
-"""What a tracker says, put together: where the imaging plane lies and where the needle is in it."""
+"""Tracked transforms combined: position of the imaging plane, and of the needle in it."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ from echospline.scene import (
 )
 
 MOST = 100
-"""Transforms that are remembered; a tracker has a dozen."""
+"""Transforms stored at most; a tracker has a dozen."""
 
 
 @dataclass(frozen=True)
 class Naming:
-    """Which frames mean what.
+    """Names of frames.
 
     Parameters
     ----------
     needles : tuple of str
         Frames at the needle's tip, the first that can be found counts (``NeedleTipToReference``).
     reference : str
-        The frame that everything is told in.
+        The frame of all positions sent.
     image : str
         The image's frame; also its device name.
     axis : (x, y, z)
         Direction of insertion in the needle's frame.
     plane : ImagingPlane
-        Where the image lies until a transform from it arrives.
+        Plane of the image until a transform from it arrives.
     calibration : mapping of str to ndarray
         Fixed transforms (``NeedleTipToNeedle``, ``ImageToProbe``).
     """
@@ -51,16 +51,16 @@ class Naming:
 
 @dataclass(frozen=True)
 class Located:
-    """What is known now.
+    """Positions of plane and needle by the newest transforms.
 
     Parameters
     ----------
     plane : ImagingPlane
-        Where the image lies.
+        Plane of the image.
     needle : TrackedNeedle or None
-        Where the needle is, if the transforms lead to it.
+        The needle, if a chain of transforms leads to it.
     trouble : str
-        What is wrong, empty if nothing is.
+        Description of a fault; empty if there is none.
     """
 
     plane: ImagingPlane
@@ -69,14 +69,14 @@ class Located:
 
 
 class Tracking:
-    """The newest transform of each name; `locate` puts them together.
+    """Stores the newest transform of each name; `locate` combines them.
 
     Parameters
     ----------
     grid : RegularGrid
         The image's pixels.
     naming : Naming
-        Which frames mean what.
+        Names of frames.
     """
 
     def __init__(self, grid: RegularGrid, naming: Naming) -> None:
@@ -87,7 +87,7 @@ class Tracking:
             as_transform(matrix)
 
     def put(self, name: str, matrix: Floats) -> None:
-        """Take a transform.
+        """Store a transform.
 
         Raises
         ------
@@ -100,7 +100,7 @@ class Tracking:
         self._known[name] = matrix
 
     def locate(self) -> Located:
-        """Where plane and needle are by the newest transforms."""
+        """Locate plane and needle by the newest transforms."""
         n = self.naming
         known = {**n.calibration, **self._known}
         plane, trouble = n.plane, ""

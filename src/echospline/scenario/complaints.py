@@ -1,4 +1,4 @@
-"""What is wrong with a scenario, in one sentence; and what a key means, for help texts."""
+"""Messages: the fault of a scenario in one sentence, and the meaning of a key for help texts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pydantic_core import ErrorDetails
 
 
 def describe(root: type[BaseModel], key: str) -> str:
-    """Return what a key of the tables below ``root`` means, ``"needle.depth"`` -> its description with range and default, for help texts."""
+    """Describe a key of the tables below ``root``: ``"needle.depth"`` -> its description with range and default."""
     *tables, last = key.split(".")
     section = _section_of(root, tables)
     if section is None:
@@ -39,7 +39,7 @@ def _plain(value: object) -> str:
 
 
 def sentence(root: type[BaseModel], fault: ErrorDetails) -> str:
-    """Say the key, the value and what is expected."""
+    """Name the key, the value and the expectation in one sentence."""
     names = [n for n in fault["loc"] if isinstance(n, int) or not _is_branch(str(n))]
     key = ".".join(str(n) for n in names)
     value = fault["input"]
@@ -57,7 +57,7 @@ def sentence(root: type[BaseModel], fault: ErrorDetails) -> str:
 
 
 def _is_branch(name: str) -> bool:
-    """Tell pydantic's names of union members ("constrained-float") from keys."""
+    """Distinguish pydantic's names of union members ("constrained-float") from keys."""
     return not name.isidentifier() or name in ("float", "list", "tuple")
 
 

@@ -1,4 +1,4 @@
-"""Where the words "tps", "elastic", "green" and "fem" become classes: imported by the command line and the study alone."""
+"""The words "tps", "elastic", "green" and "fem" become classes here and nowhere else."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MODELS = ("tps", "elastic", "green", "fem")
 def build_model(
     scenario: Scenario, grid: RegularGrid, *, kind: str | None = None, folder: Path | None = None
 ) -> TissueModel[Any]:
-    """Build the tissue model that a scenario asks for.
+    """Build the tissue model of a scenario.
 
     Parameters
     ----------
@@ -39,12 +39,12 @@ def build_model(
     kind : {"tps", "elastic", "green", "fem"}, optional
         Another model than the scenario's, for the same scene.
     folder : Path, optional
-        Where relative paths of the scenario start; the working folder when not given.
+        Start of the scenario's relative paths; the working folder when not given.
 
     Raises
     ------
     InputError
-        If there is no such model or its parameters do not make one.
+        If there is no such model or its parameters are invalid.
     """
     kind = kind or scenario.model.kind
     tissue = scenario.make_tissue(folder or Path(), grid)

@@ -108,5 +108,5 @@ class PhantomSection(Section):
         return UltrasoundImage(picture.pixels, picture.grid, "speckle phantom")
 
     def display(self) -> Display:
-        """Return how it is shown."""
+        """Return the log compression of the picture."""
         return Display(self.dynamic_range)

@@ -30,12 +30,12 @@ SUFFIX = {
     "igs.mha": "run.igs.mha", "seq.nrrd": "run.seq.nrrd",
 }  # fmt: skip
 WITNESSES = ("echospline", "numpy", "scipy", "numba", "opencv-python-headless", "scikit-fem", "av")
-"""Packages whose versions a report names."""
+"""Packages whose versions are in a report."""
 
 
 @dataclass
 class _Tally:
-    """What is counted while frames go by."""
+    """Counts over the frames of a run."""
 
     stages: dict[str, list[float]] = field(default_factory=dict)
     largest: float = 0.0
@@ -55,7 +55,7 @@ def _sink(
     name: str, stack: ExitStack, out: Path, image: UltrasoundImage, fps: float
 ) -> Callable[[Frame], None]:
     """Open the writer of one format."""
-    if name in ("igs.mha", "seq.nrrd"):  # for PLUS and 3D Slicer: the needle's transforms beside the pictures
+    if name in ("igs.mha", "seq.nrrd"):  # for PLUS and 3D Slicer: pictures with the needle's transforms
         recording = stack.enter_context(SequenceWriter(out / SUFFIX[name], image.grid))
         return lambda frame: recording.add(frame.image.pixels, frame.time, frame.pose)
     cine = stack.enter_context(open_writer(out / SUFFIX[name], image.grid, fps))
@@ -72,29 +72,29 @@ def run(
     progress: Callable[[int, int], None] | None = None,
     form_image: ImageFormer | None = None,
 ) -> dict[str, Any]:
-    """Simulate a scenario and write what it asks for.
+    """Simulate a scenario and write its results.
 
     Parameters
     ----------
     scenario : Scenario
-        What to run.
+        The scenario.
     image : UltrasoundImage
         Its image.
     model : TissueModel
         Its model.
     out : Path
-        Folder for the results; made where it is not there. Every file gets its name when it is whole.
+        Folder for the results; created if missing. Every file gets its name when it is whole.
     folder : Path
-        Where relative paths of the scenario start.
+        Start of the scenario's relative paths.
     progress : callable, optional
-        Called with (frames done, frames in all).
+        Called with (frames done, number of frames).
     form_image : callable, optional
         See `simulate`.
 
     Returns
     -------
     dict
-        What ``run.json`` holds.
+        The content of ``run.json``.
 
     Raises
     ------
@@ -111,7 +111,7 @@ def run(
     tally, files = _Tally(), []
     first = shown = deepest = None
     with ExitStack() as stack:
-        # matrices of a few hundred rows: waking a second thread costs more than it brings
+        # matrices of a few hundred rows: starting a second thread costs more than it saves
         stack.enter_context(threadpool_limits(limits=1, user_api="blas"))
         sinks = []
         for name in dict.fromkeys(output.formats):

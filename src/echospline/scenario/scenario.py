@@ -1,4 +1,4 @@
-"""A scenario: one commented TOML file that fixes a run completely; read, validated, written back resolved.
+"""A scenario: one commented TOML file that determines a run completely; read, validated and written with all defaults.
 
 The tables and their keys are in `echospline.scenario.sections`.
 """
@@ -52,7 +52,7 @@ LARGEST_FILE = 1_000_000
 
 
 class Scenario(Section):
-    """One run, completely.
+    """Complete description of one run.
 
     Read one with `load`, change it with `with_values`, write it with `save`.
     """
@@ -75,7 +75,7 @@ class Scenario(Section):
         Raises
         ------
         InputError
-            If a key is unknown or a value not of its kind.
+            If a key is unknown or a value invalid.
         """
         tree = self.model_dump(mode="json", exclude_unset=False)
         for key, value in values.items():
@@ -87,7 +87,7 @@ class Scenario(Section):
         return validated(tree, origin)
 
     def read_image(self, folder: Path) -> UltrasoundImage:
-        """Read the image; a relative path is taken from ``folder``; sample:phantom is [phantom] at rest."""
+        """Read the image; a relative path starts at ``folder``; sample:phantom is [phantom] at rest."""
         section = self.image
         if section.file == PHANTOM:
             return self.phantom.still(self.probe.probe())
@@ -136,7 +136,7 @@ class Scenario(Section):
         return Tissue(t.young, t.poisson, regions, t.thickness, t.plane)
 
     def save(self, path: Path, folder: Path) -> None:
-        """Write the scenario with a comment beside every key; relative paths in ``folder`` stay valid from ``path``."""
+        """Write the scenario with a comment for every key; relative paths in ``folder`` stay valid from ``path``."""
         document = tomlkit.document()
         document.add(
             tomlkit.comment("echospline scenario: run it with  echospline simulate THIS_FILE --out DIR")
@@ -157,7 +157,7 @@ def load(path: str | Path) -> Scenario:
     Raises
     ------
     InputError
-        With the key, the value and what is expected.
+        With the key, the value and the expectation.
     """
     path = Path(path)
     try:
@@ -179,7 +179,7 @@ def validated(tree: Mapping[str, Any], origin: str) -> Scenario:
     Raises
     ------
     InputError
-        One sentence on the first fault, and how many more there are.
+        One sentence on the first fault, and the number of others.
     """
     try:
         return Scenario.model_validate(tree)
@@ -190,7 +190,7 @@ def validated(tree: Mapping[str, Any], origin: str) -> Scenario:
 
 
 def describe(key: str) -> str:
-    """Return what a key means with its range and default: ``describe("needle.depth")``."""
+    """Describe a key with its range and default: ``describe("needle.depth")``."""
     return _describe(Scenario, key)
 
 

@@ -1,4 +1,4 @@
-"""Beamformed echoes: complex baseband (IQ) lines beside their grid; RF, envelope and B-mode made from them."""
+"""Beamformed echoes: complex baseband (IQ) lines with their grid, and RF, envelope and B-mode derived from them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Complexes = NDArray[np.complexfloating]
 
 @dataclass(frozen=True)
 class Display:
-    """How an envelope becomes grey.
+    """Log compression of an envelope to grey.
 
     Parameters
     ----------
@@ -39,14 +39,14 @@ class Display:
             )
 
     def grey(self, envelope: NDArray[np.generic]) -> NDArray[np.uint8]:
-        """Log-compressed 8-bit grey; what lies outside the range is black or white, as on a scanner."""
+        """Compress an envelope to 8-bit grey; levels outside the range become black or white, as on a scanner."""
         with np.errstate(divide="ignore"):
             level = 20.0 * np.log10(np.asarray(envelope, dtype=np.float32))
         shown = 255.0 * (1.0 + (level - self.top) / self.dynamic_range)
         return np.asarray(np.rint(np.clip(shown, 0.0, 255.0)), dtype=np.uint8)
 
     def envelope(self, grey: NDArray[np.generic]) -> Floats:
-        """Undo `grey`: amplitude of 8-bit grey (0 to 255)."""
+        """Invert `grey`: return the amplitude of 8-bit grey (0 to 255)."""
         level = (np.asarray(grey, dtype=np.float64) / 255.0 - 1.0) * self.dynamic_range + self.top
         amplitude: Floats = 10.0 ** (level / 20.0)
         return amplitude
@@ -105,7 +105,7 @@ class Echo:
         return cls(analytic * turn[:, None], grid, carrier)
 
     def rf(self, sampling: float, sound_speed: float = 1.54) -> tuple[Floats, RegularGrid]:
-        """Real lines sampled at ``sampling`` MHz and the grid of their samples (band-limited interpolation)."""
+        """Return real lines sampled at ``sampling`` MHz and the grid of their samples (band-limited interpolation)."""
         spacing = sound_speed / 2.0 / sampling
         if self.carrier * spacing >= 0.5:
             raise InputError(
@@ -123,11 +123,11 @@ class Echo:
         return np.real(baseband * np.exp(2j * pi * self.carrier * out.y)[:, None]), out
 
     def envelope(self) -> Floats:
-        """Magnitude, shape (rows, lines)."""
+        """Return the magnitude, shape (rows, lines)."""
         return np.abs(self.iq)
 
     def b_mode(self, display: Display | None = None, grid: RegularGrid | None = None) -> UltrasoundImage:
-        """Log-compressed picture on ``grid``, which must be a sub-lattice of the samples (or their own grid)."""
+        """Return the log-compressed picture on ``grid``, which must be a sub-lattice of the samples (or their own grid)."""
         display = display or Display()
         grid = grid or self.grid
         rows, lines = _sub_lattice(self.grid, grid)
@@ -136,7 +136,7 @@ class Echo:
 
 @dataclass(frozen=True)
 class EchoCine:
-    """Frames of echoes of one grid beside their times; ``iq`` has shape (frames, rows, lines)."""
+    """Frames of echoes on one grid, with their times; ``iq`` has shape (frames, rows, lines)."""
 
     iq: Complexes
     times: Floats
@@ -168,12 +168,12 @@ def band_limited(iq: Complexes, factor: int, axis: int = 0) -> Complexes:
 
 
 def fourier_frequencies(n: int, spacing: float) -> Floats:
-    """Frequencies of an n-point transform in cycles per mm."""
+    """Return the frequencies of an n-point transform in cycles per mm."""
     return np.asarray(fft.fftfreq(n, spacing), dtype=np.float64)
 
 
 def _sub_lattice(fine: RegularGrid, coarse: RegularGrid) -> tuple[slice, slice]:
-    """Slices (rows, columns) that pick the points of ``coarse`` out of ``fine``."""
+    """Return the slices (rows, columns) that pick the points of ``coarse`` out of ``fine``."""
     step = np.divide(coarse.spacing, fine.spacing)
     start = fine.to_index(coarse.origin)
     whole = np.rint(np.concatenate([step, start])).astype(int)

@@ -1,4 +1,4 @@
-"""A regular grid in the imaging plane: mesh nodes and pixel centres alike, millimetres <-> index."""
+"""A regular grid in the imaging plane: mesh nodes and pixel centres alike, with conversion between millimetres and indices."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def as_points(points: ArrayLike, name: str = "points") -> Floats:
     points : array_like, shape (n, 2) or (2,)
         (x lateral, y depth) in mm.
     name : str
-        What the points are called in an error message.
+        Name of the points in an error message.
 
     Returns
     -------
@@ -122,29 +122,29 @@ class RegularGrid:
         return nodes
 
     def to_index(self, points: ArrayLike) -> Floats:
-        """Fractional (ix, iy) of points in mm, shape (n, 2)."""
+        """Convert points in mm to fractional (ix, iy), shape (n, 2)."""
         index: Floats = (np.asarray(points, dtype=np.float64) - self.origin) / self.spacing
         return index
 
     def to_mm(self, index: ArrayLike) -> Floats:
-        """Position in mm of fractional indices (ix, iy), shape (n, 2)."""
+        """Convert fractional indices (ix, iy) to positions in mm, shape (n, 2)."""
         points: Floats = np.asarray(index, dtype=np.float64) * self.spacing + self.origin
         return points
 
     def contains(self, points: ArrayLike) -> NDArray[np.bool_]:
-        """Which points in mm lie inside the extent, edges included, shape (n,)."""
+        """Test which points in mm lie inside the extent, edges included, shape (n,)."""
         x0, x1, y0, y1 = self.extent
         p = np.atleast_2d(np.asarray(points, dtype=np.float64))
         inside: NDArray[np.bool_] = (p[:, 0] >= x0) & (p[:, 0] <= x1) & (p[:, 1] >= y0) & (p[:, 1] <= y1)
         return inside
 
     def nearest(self, point: ArrayLike) -> int:
-        """Index of the node nearest to one point in mm."""
+        """Return the index of the node nearest to one point in mm."""
         ij = np.clip(np.rint(self.to_index(point)), 0, np.subtract(self.shape, 1)).astype(int)
         return int(ij[1] * self.shape[0] + ij[0])
 
     def boundary(self, edges: Iterable[str]) -> NDArray[np.intp]:
-        """Indices of the nodes on the named edges, ascending, each once.
+        """Return the indices of the nodes on the named edges, ascending, each once.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""An ultrasound image: pixels beside the grid of their centres in mm; a cine: frames beside times."""
+"""An ultrasound image (pixels and the grid of their centres in mm) and a cine (frames and their times)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class UltrasoundImage:
     grid : RegularGrid
         Pixel centres in mm; ``grid.shape == (columns, rows)``.
     source : str
-        Where the picture comes from (file, licence), for reports.
+        Origin of the picture (file, licence), for reports.
 
     Raises
     ------
@@ -58,7 +58,7 @@ class UltrasoundImage:
 
 @dataclass(frozen=True)
 class Cine:
-    """Frames of one grid beside their times.
+    """Frames on one grid, with their times.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ class Cine:
     grid : RegularGrid
         Pixel centres in mm.
     source : str
-        Where the recording comes from.
+        Origin of the recording.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Between three dimensions and the imaging plane: where the plane lies, and what of a tracked needle it sees.
+"""The imaging plane in space, and the part of a tracked needle that its beam shows.
 
 The plane's own frame is right-handed, in mm: x lateral (the image's columns), y depth (its rows), z = x cross y out of
 the plane. For an image of orientation MF, x points to the marked side of the probe and y away from it, as PLUS has it.
@@ -17,7 +17,7 @@ from echospline.scene.needle import NeedlePose
 from echospline.scene.transform import as_transform
 
 AXIAL = np.array([[-1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-"""Plane to RAS when nobody says otherwise: x to the patient's left, y to the back, z to the head.
+"""Plane to RAS unless a transform gives another: x to the patient's left, y to the back, z to the head.
 
 3D Slicer's axial view, seen from the feet, then shows the picture as echospline's own page does."""
 
@@ -29,7 +29,7 @@ CROSS_SECTION = 1.0
 
 @dataclass(frozen=True, eq=False)
 class ImagingPlane:
-    """Where the imaging plane lies.
+    """Position of the imaging plane in space.
 
     Parameters
     ----------
@@ -55,9 +55,9 @@ class ImagingPlane:
 
     @classmethod
     def of_image(cls, image_to_reference: Floats, grid: RegularGrid) -> ImagingPlane:
-        """Plane of an image whose matrix takes (column, row, slice) to the reference frame.
+        """Return the plane of an image whose matrix takes (column, row, slice) to the reference frame.
 
-        The third axis is made from the first two: what a 2-D image's matrix says about slices means nothing.
+        The third axis is made from the first two: the third column of a 2-D image's matrix carries no information.
 
         Parameters
         ----------
@@ -85,21 +85,21 @@ class ImagingPlane:
         return cls(plane)
 
     def image_matrix(self, grid: RegularGrid) -> Floats:
-        """Matrix from (column, row, slice) to the reference frame, for an IMAGE; a slice is 1 mm thick."""
+        """Return the matrix from (column, row, slice) to the reference frame, for an IMAGE; a slice is 1 mm thick."""
         (dx, dy), (x0, y0) = grid.spacing, grid.origin
         pixel_to_plane = np.array([[dx, 0, 0, x0], [0, dy, 0, y0], [0, 0, 1, 0], [0, 0, 0, 1]])
         matrix: Floats = self.matrix @ pixel_to_plane
         return matrix
 
     def lift(self, points: Floats) -> Floats:
-        """Points of the plane (n, 2) mm in the reference frame, shape (n, 3)."""
+        """Convert points of the plane (n, 2) mm to the reference frame, shape (n, 3)."""
         lifted: Floats = points @ self.matrix[:3, :2].T + self.matrix[:3, 3]
         return lifted
 
     def see(
         self, tip_to_reference: Floats, axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
     ) -> TrackedNeedle:
-        """Needle in the frame of the plane.
+        """Convert a needle to the frame of the plane.
 
         Parameters
         ----------
@@ -120,7 +120,7 @@ class ImagingPlane:
         )
 
     def tip_matrix(self, pose: NeedlePose) -> Floats:
-        """Frame at the tip of a needle in the plane, to the reference frame: +Z inserts, +Y is the plane's z."""
+        """Return the matrix from a frame at the tip of a needle in the plane to the reference frame: +Z inserts, +Y is the plane's z."""
         x, y = pose.axis if pose.depth > 0 else (0.0, 1.0)
         tip = np.eye(4)
         tip[:3, 2], tip[:3, 1] = (x, y, 0.0), (0.0, 0.0, 1.0)
@@ -132,7 +132,7 @@ class ImagingPlane:
 
 @dataclass(frozen=True)
 class Reach:
-    """What counts as near the plane.
+    """Distances within which a needle counts as near the plane.
 
     Parameters
     ----------
@@ -186,17 +186,17 @@ class TrackedNeedle:
         return degrees(asin(min(1.0, abs(self.direction[2]))))
 
     def pose(self, grid: RegularGrid, reach: Reach) -> NeedlePose | None:
-        """What the tissue feels: the needle projected onto the plane, entering where it crosses the skin.
+        """Project the needle onto the plane; it enters where it crosses the skin.
 
-        The skin is the image's first row, continued to both sides. Before it, the needle waits at the point
-        that it aims at, at depth 0. None when the needle is too far away to move this tissue.
+        The skin is the image's first row, continued to both sides. A needle before the skin has
+        depth 0 and lies at the point that it aims at. None when the needle is too far away to move this tissue.
 
         Parameters
         ----------
         grid : RegularGrid
             The image's pixels.
         reach : Reach
-            What counts as far.
+            Distances beyond which it is too far away.
         """
         x0, x1, skin, bottom = grid.extent
         (x, y, z), (dx, dy, _) = self.tip, self.direction
@@ -210,10 +210,10 @@ class TrackedNeedle:
         return NeedlePose((x - back * dx, y - back * dy), (x, y))
 
     def seen(self, skin: float, reach: Reach) -> Visible | None:
-        """What the beam shows of the needle; None if it is outside, or not yet below the skin.
+        """Return the piece of the needle inside the beam; None if there is none, or the tip is not below the skin.
 
-        A needle that crosses the plane ends in the picture where it leaves the beam: its true tip is out of
-        sight, as at the bedside.
+        A needle that crosses the plane ends in the picture where it leaves the beam: its true tip is not
+        visible, as at the bedside.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""How far two displacement fields are apart, equation (24)."""
+"""Differences between two displacement fields, equation (24)."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class FieldError:
 
 
 def distance(a: ArrayLike, b: ArrayLike) -> Floats:
-    """Epsilon = |a - b| per node, mm, shape (..., n) of fields (..., n, 2)."""
+    """Return epsilon = |a - b| per node, mm, shape (..., n) of fields (..., n, 2)."""
     difference = np.asarray(a, dtype=np.float64) - np.asarray(b, dtype=np.float64)
     if difference.shape[-1:] != (2,):
         raise InputError(f"displacement fields must have shape (..., n, 2) in mm; got {difference.shape}")

@@ -1,4 +1,4 @@
-"""The needle: where it is (pose) and how it moves (insertion), equations (10), (11) and (13)."""
+"""The needle: its pose and its motion (insertion), equations (10), (11) and (13)."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from echospline.errors import InputError
 from echospline.scene.grid import Floats, as_points
 
 SAME_TIME = 1e-9
-"""s; times closer than this are one: k / fps and a keyframe meet in spite of rounding."""
+"""s; times closer than this are equal, so that k / fps and a keyframe agree in spite of rounding."""
 ZERO_LENGTH = 1e-9
 """mm; a needle shorter than this has no direction, touches nothing and pushes nothing."""
 
 
 @dataclass(frozen=True, slots=True)
 class NeedlePose:
-    """Where the needle is at one instant.
+    """Position of the needle at one instant.
 
     Parameters
     ----------
@@ -64,13 +64,13 @@ class NeedlePose:
         return ((self.tip[0] - self.entry[0]) / length, (self.tip[1] - self.entry[1]) / length)
 
     def shaft(self, t: ArrayLike) -> Floats:
-        """Points n(t) on the shaft, 0 <= t <= 1 from entry to tip, equation (10), shape (k, 2) mm."""
+        """Return points n(t) on the shaft, 0 <= t <= 1 from entry to tip, equation (10), shape (k, 2) mm."""
         ns, nt = np.asarray(self.entry), np.asarray(self.tip)
         points: Floats = ns + np.atleast_1d(np.asarray(t, dtype=np.float64))[:, None] * (nt - ns)
         return points
 
     def closest(self, points: ArrayLike) -> tuple[Floats, Floats]:
-        """Closest point of the shaft to each point, equations (11) and (13).
+        """Find the closest point of the shaft to each point, equations (11) and (13).
 
         Parameters
         ----------
@@ -94,7 +94,7 @@ class NeedlePose:
 
 @dataclass(frozen=True)
 class Insertion:
-    """A needle's path: keyframes of entry and tip, straight lines between them.
+    """A needle's path: keyframes of entry and tip with straight lines between them.
 
     Parameters
     ----------
@@ -143,7 +143,7 @@ class Insertion:
         retract: bool = False,
         retract_speed: float | None = None,
     ) -> Insertion:
-        """Push straight in, wait, and perhaps pull out again.
+        """Build a path that goes straight in, rests and, if asked, comes out again.
 
         Parameters
         ----------
@@ -197,7 +197,7 @@ class Insertion:
         return float(self.times[-1] - self.times[0])
 
     def pose(self, t: float) -> NeedlePose:
-        """Pose at time t (s); before the first and after the last keyframe the needle rests there.
+        """Return the pose at time t (s); before the first and after the last keyframe the needle rests there.
 
         The speed is that of the segment which ends at or contains t, so that the last step of an
         insertion still moves and the first step of a rest does not.

@@ -1,4 +1,4 @@
-"""What the tissue is made of: Young's modulus and Poisson's ratio, region by region."""
+"""Material of the tissue: Young's modulus and Poisson's ratio, region by region."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ Mask = NDArray[np.bool_]
 
 
 class Shape(Protocol):
-    """Where a region is."""
+    """Place of a region."""
 
     def contains(self, points: Floats) -> Mask:
-        """Which points (n, 2) in mm belong to the region, shape (n,)."""
+        """Test which points (n, 2) in mm belong to the region, shape (n,)."""
         ...
 
 
@@ -37,7 +37,7 @@ class Layer:
             )
 
     def contains(self, points: Floats) -> Mask:
-        """Which points lie between the depths."""
+        """Test which points lie between the depths."""
         inside: Mask = (points[:, 1] >= self.top) & (points[:, 1] < self.bottom)
         return inside
 
@@ -55,7 +55,7 @@ class Circle:
             raise InputError(f"radius of a circle must be a positive number in mm; got {self.radius}")
 
     def contains(self, points: Floats) -> Mask:
-        """Which points lie within the radius."""
+        """Test which points lie within the radius."""
         inside: Mask = np.hypot(*(points - self.centre).T) <= self.radius
         return inside
 
@@ -71,7 +71,7 @@ class Polygon:
             raise InputError(f"a polygon needs three or more vertices; got {len(self.vertices)}")
 
     def contains(self, points: Floats) -> Mask:
-        """Which points lie inside, by the parity of edges that a ray along +x crosses."""
+        """Test which points lie inside, by the parity of edges that a ray along +x crosses."""
         a = np.asarray(self.vertices, dtype=np.float64)
         b = np.roll(a, -1, axis=0)
         x, y = points[:, 0, None], points[:, 1, None]
@@ -84,7 +84,7 @@ class Polygon:
 
 @dataclass(frozen=True)
 class Label:
-    """Where a labels image holds one value: ``labels`` [depth, lateral] of integers on ``grid`` (nearest pixel)."""
+    """Pixels of a labels image that hold one value: ``labels`` [depth, lateral] of integers on ``grid`` (nearest pixel)."""
 
     labels: NDArray[np.integer] = field(repr=False)
     grid: RegularGrid
@@ -98,7 +98,7 @@ class Label:
             )
 
     def contains(self, points: Floats) -> Mask:
-        """Which points have this label; none outside the image."""
+        """Test which points have this label; none outside the image."""
         ix, iy = np.rint(self.grid.to_index(points)).astype(np.intp).T
         nx, ny = self.grid.shape
         within = (ix >= 0) & (ix < nx) & (iy >= 0) & (iy < ny)
@@ -108,7 +108,7 @@ class Label:
 
 @dataclass(frozen=True)
 class Region:
-    """Part of the tissue that differs: where, its Young's modulus (kPa), Poisson's ratio and name."""
+    """Part of the tissue that differs: its shape, Young's modulus (kPa), Poisson's ratio and name."""
 
     shape: Shape
     young: float
@@ -132,7 +132,7 @@ class Tissue:
     regions : sequence of Region
         Each lies on top of those before it.
     thickness : float
-        Across the imaging plane, mm: what a force in newtons is spread over.
+        Across the imaging plane, mm; a force in newtons is spread over it.
     plane : {"stress", "strain"}
         "stress" (equation (19)) lets the slab bulge out of the plane, "strain" does not.
 
@@ -162,7 +162,7 @@ class Tissue:
         return all((r.young, r.poisson) == (self.young, self.poisson) for r in self.regions)
 
     def at(self, points: ArrayLike) -> tuple[Floats, Floats]:
-        """Young's modulus (kPa) and Poisson's ratio at points (n, 2) in mm, each of shape (n,)."""
+        """Return Young's modulus (kPa) and Poisson's ratio at points (n, 2) in mm, each of shape (n,)."""
         p = as_points(points)
         young, poisson = np.full(len(p), float(self.young)), np.full(len(p), float(self.poisson))
         for region in self.regions:
@@ -171,7 +171,7 @@ class Tissue:
         return young, poisson
 
     def in_cells(self, grid: RegularGrid, samples: int = 4) -> tuple[Floats, Floats]:
-        """Young's modulus (kPa) and Poisson's ratio per mesh cell, x fastest, each of shape ((nx-1) (ny-1),).
+        """Return Young's modulus (kPa) and Poisson's ratio per mesh cell, x fastest, each of shape ((nx-1) (ny-1),).
 
         A cell that a boundary crosses gets the mean over ``samples`` x ``samples`` points, so that a round lesion
         does not turn into a staircase of whole cells.

@@ -1,4 +1,4 @@
-"""The probe: centre frequency, bandwidth and aperture, and the point spread function they give."""
+"""The transducer: centre frequency, bandwidth and aperture, and the point spread function they give."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Transducer:
     snr : float
         Power of 0 dB speckle over power of electronic noise, dB, at mid-depth; infinite for none.
     attenuation : float
-        dB / (cm MHz), one way. The time gain compensation undoes it, so what remains is noise growing with depth.
+        dB / (cm MHz), one way. The time gain compensation undoes it, so its only effect is noise that grows with depth.
     focus : float, optional
         Depth of the transmit focus, mm: the beam widens away from it. Focused at every depth when not given.
     sound_speed : float
@@ -102,7 +102,7 @@ class Transducer:
         return 0.886 * self.wavelength * self.f_number / FWHM
 
     def beam(self, depth: ArrayLike) -> Floats:
-        """Standard deviation of the two-way beam at depths in mm, mm.
+        """Return the standard deviation of the two-way beam at depths in mm, mm.
 
         Away from a fixed focus the beam widens as a Gaussian beam does, by sqrt(1 + ((y - focus) / r)^2),
         with the Rayleigh range r = pi w^2 / lambda of a one-way waist w = 2 sigma (two-way amplitude

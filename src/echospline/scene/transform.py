@@ -1,4 +1,4 @@
-"""Coordinate frames and the transforms between them, by the names that PLUS and Slicer give (``NeedleToReference``)."""
+"""Rigid transforms between coordinate frames, named as PLUS and Slicer name them (``NeedleToReference``)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _TO = re.compile(r"(?<=.)To(?=[A-Z])")
 
 
 def frames_of(name: str) -> tuple[str, str]:
-    """Frames of a transform's name: ``ToolToTracker`` takes coordinates of Tool to those of Tracker.
+    """Split a transform's name into its frames: ``ToolToTracker`` takes coordinates of Tool to those of Tracker.
 
     Raises
     ------
@@ -29,7 +29,7 @@ def frames_of(name: str) -> tuple[str, str]:
 
 
 def transform_between(transforms: Mapping[str, Floats], source: str, target: str) -> Floats | None:
-    """Matrix from frame ``source`` to frame ``target``, along the fewest known transforms; None if none lead there.
+    """Return the matrix from frame ``source`` to frame ``target`` along the fewest transforms; None if none lead there.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def transform_between(transforms: Mapping[str, Floats], source: str, target: str
             if other in found:
                 continue
             if inverse and abs(np.linalg.det(matrix[:3, :3])) < 1e-12:
-                continue  # a flat transform leads one way only
+                continue  # a singular transform cannot be inverted
             found[other] = (np.linalg.inv(matrix) if inverse else matrix) @ found[frame]
             queue.append(other)
     return None

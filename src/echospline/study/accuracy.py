@@ -109,7 +109,7 @@ class Case:
         return NeedleForces(0.4, self.friction, ramp=0.0)
 
     def poses(self, trajectory: tuple[tuple[float, float], float, float]) -> tuple[Floats, list[NeedlePose]]:
-        """Times (s) and poses of a trajectory: rest, then ``steps`` equal depths."""
+        """Return the times (s) and poses of a trajectory: rest, then ``steps`` equal depths."""
         insertion = Insertion.straight(trajectory[0], trajectory[1], trajectory[2], SPEED)
         times = np.linspace(0.0, insertion.duration, self.steps + 1)
         return times, [insertion.pose(float(t)) for t in times]
@@ -147,7 +147,7 @@ def table_rows(
     held: FieldError,
     values: Mapping[str, float],
 ) -> list[dict[str, Any]]:
-    """Rows of one model: on the fitted trajectory and on the held-out ones."""
+    """Return the rows of one model: on the fitted trajectory and on the held-out ones."""
     return [
         {
             "case": case.name,
@@ -230,7 +230,7 @@ def spline_model(
 
 
 def oracle(grid: RegularGrid, seen: Observation, kernel: Kernel) -> Floats:
-    """Fields of a spline through the truth: the true displacement at every node near the axis, anchors held.
+    """Fit a spline through the truth (the true displacement at every node near the axis, anchors held) and return its fields.
 
     No law of interaction can do better with these landmarks: what is left is the kernel's own error.
     """
@@ -246,7 +246,7 @@ def oracle(grid: RegularGrid, seen: Observation, kernel: Kernel) -> Floats:
 
 
 def discretisation(**arguments: Any) -> dict[str, Any]:
-    """Error of the finite-element mesh itself: against a mesh four times as fine, at the coarse nodes."""
+    """Measure the error of the finite-element mesh itself against a mesh four times as fine, at the coarse nodes."""
     case = Case(**{**arguments, "nodes": tuple(arguments["nodes"])})
     nx, ny = case.nodes
     fine = replace(case, nodes=(4 * (nx - 1) + 1, 4 * (ny - 1) + 1))
@@ -324,5 +324,5 @@ def _joint(fields: Sequence[Floats], seen: Sequence[Observation]) -> FieldError:
 
 
 def case_arguments(case: Case) -> dict[str, Any]:
-    """Arguments of `accuracy` as JSON holds them."""
+    """Return the arguments of `accuracy` as JSON holds them."""
     return asdict(case)

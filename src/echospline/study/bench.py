@@ -60,7 +60,7 @@ def scene(shape: tuple[int, int], kernel: Kernel | None = None) -> TPSModel:
 
 
 def path(period: float = PERIOD, depth: float = 26.0) -> Iterator[NeedlePose]:
-    """Poses of an oblique push from the surface down to ``depth`` mm, one each ``period`` s."""
+    """Return the poses of an oblique push from the surface down to ``depth`` mm, one each ``period`` s."""
     axis = np.array([0.4, np.sqrt(1 - 0.16)])
     for i in range(1, int(depth / SPEED / period) + 1):
         tip = np.array([12.3, 0.0]) + axis * (i * period * SPEED)
@@ -99,12 +99,12 @@ def time_steps(
 
 
 def _work(statistics: Statistics) -> int:
-    """How much has been done for the tip's column so far."""
+    """Count the work done for the tip's column so far."""
     return statistics.patches + statistics.built + statistics.direct
 
 
 def bare_product(step: FusedStep, repeats: int = 400) -> float:
-    """Median time in ms of the float32 product of the contacts' displacements and their rows: what no step can beat."""
+    """Return the median time in ms of the float32 product of the contacts' displacements and their rows: what no step can beat."""
     r, c = step.response, step.response.scene.components
     rows = r.single[r.head : r.head + r.count * c]
     weights = np.ones((2 // c, len(rows)), dtype=np.float32)

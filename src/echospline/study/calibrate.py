@@ -156,7 +156,7 @@ def _table(kind: str) -> str:
 
 
 def _chosen(seen: Observation, count: int) -> NDArray[np.intp]:
-    """Evenly spaced frames; those at which the needle stops belong to them, or relaxation would start late."""
+    """Choose evenly spaced frames, those at which the needle stops included: otherwise relaxation would start late."""
     every = np.arange(len(seen.poses))
     if count < 0:
         raise InputError(f"frames must be 0 (all) or a positive number; got {count}")
@@ -188,7 +188,7 @@ def _run(
 
 
 def _axes(kind: str, seen: Observation, runs: int) -> dict[str, Sequence[float]]:
-    """Values for the brute force, from none to what the largest displacement could ask for."""
+    """Return the values for the brute force, from none to the most that the largest displacement allows."""
     if runs < 8:
         raise InputError(f"a grid needs 8 runs or more; got {runs}")
     largest = float(np.nanmax(np.hypot(seen.displacement[..., 0], seen.displacement[..., 1])))

@@ -25,7 +25,7 @@ def save_both(figure: Figure, stem: Path) -> None:
 
 
 def error_map(points: Floats, error: Floats, stem: Path, title: str) -> None:
-    """Mean error of an identified field at the observed points (n, 2) in mm; untracked points (nan) are left out."""
+    """Draw the mean error of an identified field at the observed points (n, 2) in mm; untracked points (nan) are left out."""
     figure = Figure(figsize=(6.4, 4.8), layout="constrained")
     axes = figure.subplots()
     known = np.isfinite(error)

@@ -124,7 +124,7 @@ def _below(moduli: Sequence[Row]) -> dict[str, str]:
 
 
 def _thin_plate(moduli: Sequence[Row]) -> dict[str, list[Row]]:
-    """Fitted thin-plate rows on the fitted insertion, as in the paper, by reading of the moduli."""
+    """Select the fitted thin-plate rows on the fitted insertion, as in the paper, by reading of the moduli."""
     rows = [
         r
         for r in moduli

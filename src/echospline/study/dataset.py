@@ -220,7 +220,7 @@ def imaged(scenario: Scenario, folder: Path) -> dict[str, np.ndarray[Any, Any]]:
 def needle_mask(
     grid: RegularGrid, entry: tuple[float, float], tip: tuple[float, float], radius: float
 ) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    """Pixels that the needle covers, shape (rows, columns): nearer than ``radius`` mm to the shaft."""
+    """Return the pixels that the needle covers, shape (rows, columns): nearer than ``radius`` mm to the shaft."""
     shaft = np.subtract(tip, entry)
     length2 = float(shaft @ shaft)
     if length2 == 0.0:

@@ -62,7 +62,7 @@ class Regions:
     def observation(
         self, chosen: Sequence[int], where: Where = "region", threshold: float = 0.3
     ) -> Observation:
-        """What identification sees of some of the depths: the region's points in their own frame, or all trusted."""
+        """Return the observation for some of the depths: the region's points in their own frame, or all trusted points."""
         if where == "field":
             poses = [self.poses[i] for i in chosen]
             return Observation(self.grid.nodes, self.map[list(chosen)], self.times[list(chosen)], poses)
@@ -230,7 +230,7 @@ def _identified(seen: Regions, fields: Fields, chosen: list[int], where: Where, 
 
 
 def _field(seen: Regions, fields: Fields, found: Identification, i: int, points: Floats) -> Floats:
-    """Displacement of points at depth i with the parameters found, shape (n, 2) mm."""
+    """Return the displacement of points at depth i with the parameters found, shape (n, 2) mm."""
     # an observation must displace something; its values do not enter the field
     ask = Observation(points, np.ones((1, len(points), 2)), seen.times[[i]], [seen.poses[i]])
     model = fields(ask)
@@ -238,7 +238,7 @@ def _field(seen: Regions, fields: Fields, found: Identification, i: int, points:
 
 
 def root_mean_square(error: Floats) -> float:
-    """Root of the mean squared length of vectors (n, 2)."""
+    """Return the root of the mean squared length of vectors (n, 2)."""
     return float(np.sqrt((error**2).sum(axis=-1).mean()))
 
 
@@ -252,7 +252,7 @@ def _rmse(u: Floats, seen: Regions, i: int) -> float:
 
 
 def paired(a: Floats, b: Floats) -> dict[str, Any]:
-    """Whether two models' RMSE per frame differ: paired t test, Wilcoxon's signed ranks, 95 % interval of the mean.
+    """Test whether two models' RMSE per frame differ: paired t test, Wilcoxon's signed ranks, 95 % interval of the mean.
 
     A large p does not show that they are the same; the interval says how far apart they may be.
     """
@@ -272,7 +272,7 @@ def paired(a: Floats, b: Floats) -> dict[str, Any]:
 
 
 def tracker_error(seen: Regions, truth: Sequence[Displacement]) -> Floats:
-    """RMSE of the tracker itself in the region of each depth, mm, shape (k,)."""
+    """Return the RMSE of the tracker itself in the region of each depth, mm, shape (k,)."""
     out = []
     for i, true in enumerate(truth):
         trusted = seen.confidence[i] >= 0.3
@@ -281,7 +281,7 @@ def tracker_error(seen: Regions, truth: Sequence[Displacement]) -> Floats:
 
 
 def compared(fits: Mapping[str, Fit]) -> dict[str, dict[str, Any]]:
-    """Paired tests of every two models over the depths: of the fits and of the held-out predictions."""
+    """Run paired tests of every two models over the depths: of the fits and of the held-out predictions."""
     names = list(fits)
     out: dict[str, dict[str, Any]] = {}
     for i, a in enumerate(names):

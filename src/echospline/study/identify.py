@@ -147,7 +147,7 @@ def grid_search(
     observed: Floats,
     objective: Objective = "mae",
 ) -> Identification:
-    """Brute force, as in section V of the paper: one whole simulation per combination of values.
+    """Search by brute force, as in section V of the paper: one whole simulation per combination of values.
 
     Parameters
     ----------
@@ -198,7 +198,7 @@ def _cost(
 
 
 def _descend(cost: Callable[[Floats], float], z: Floats) -> Floats:
-    """Nelder and Mead in the unit box; the cost is smooth but its derivative is not at hand."""
+    """Descend by Nelder and Mead in the unit box: the cost is smooth but its derivative is not available."""
     if not len(z):
         return z
     end = minimize(
@@ -229,7 +229,7 @@ class _Problem:
     def solve(
         self, theta: Mapping[str, float], objective: Objective, *, exact: bool = False
     ) -> tuple[dict[str, float], float]:
-        """Best linear parameters for given others, and the objective there, mm.
+        """Find the best linear parameters for given others, and the objective there, mm.
 
         How the tip's push fades near surfaces depends on sigma itself: the last sigma found stands in for it, and
         ``exact`` repeats until it is the same.
@@ -304,7 +304,7 @@ class _Problem:
     def bootstrap(
         self, A: Floats, objective: Objective, resamples: int, seed: int
     ) -> dict[str, tuple[float, float]]:
-        """95 % intervals of the linear parameters when the frames are drawn again with replacement."""
+        """Estimate 95 % intervals of the linear parameters when the frames are drawn again with replacement."""
         if resamples <= 0:
             return {}
         rng = np.random.default_rng(seed)
@@ -322,7 +322,7 @@ class _Problem:
 
 
 def _least(A: Floats, b: Floats, w: Floats, objective: Objective, floor: float, tolerance: float) -> Floats:
-    """Weighted least squares, or least distances by reweighting (Weiszfeld): convex, so it ends at the least."""
+    """Solve weighted least squares, or least distances by reweighting (Weiszfeld), which converges because it is convex."""
     p = A.shape[-1]
     flat, target = A.reshape(-1, p), b.reshape(-1)
 

@@ -120,7 +120,7 @@ def _green(grid: RegularGrid, _: Sequence[NeedlePose]) -> Step:
 
 
 def _literal(grid: RegularGrid, _: Sequence[NeedlePose]) -> Step:
-    """Algorithm 1 word for word: every node is a source, K and L built and L inverted at each step."""
+    """Build Algorithm 1 as printed: every node is a source, K and L built and L inverted at each step."""
     nodes = grid.nodes
 
     def step(pose: NeedlePose) -> Floats:
@@ -243,7 +243,7 @@ def _timed(method: Method, grid: RegularGrid, poses: Sequence[NeedlePose], secon
 
 
 def savings(rows: Sequence[dict[str, Any]], low: int = 450, high: int = 5_000) -> list[dict[str, Any]]:
-    """Processor time that each TPS (and Green) method saves against each FEM method, %, mean over meshes of ``low`` to ``high``.
+    """Return the processor time that each TPS (and Green) method saves against each FEM method, %, mean over meshes of ``low`` to ``high``.
 
     The paper's claim is 51.8 % for one such pair.
     """

@@ -67,7 +67,7 @@ class Observation:
         )
 
     def remembered_speed(self, alpha3: float) -> Floats:
-        """Speed that friction still answers to: v while the needle moves, then relaxing, equation (16); (frames,)."""
+        """Return the effective speed of friction: v while the needle moves, then relaxing, equation (16); (frames,)."""
         speed = np.zeros(len(self.poses))
         last, stopped = 0.0, float(self.times[0])
         for k, (pose, t) in enumerate(zip(self.poses, self.times, strict=True)):
@@ -107,7 +107,7 @@ class UnitFields(Protocol):
         ...
 
     def fields(self, values: Mapping[str, float]) -> Floats:
-        """Field per unit of each linear parameter, shape (frames, n, 2, p), mm per unit."""
+        """Return the field per unit of each linear parameter, shape (frames, n, 2, p), mm per unit."""
         ...
 
 
@@ -184,7 +184,7 @@ class SplineFields:
         self._frames: dict[float, list[_Frame]] = {}
 
     def fields(self, values: Mapping[str, float]) -> Floats:
-        """Field per unit of alpha1, alpha2 and sigma, shape (frames, n, 2, 3)."""
+        """Return the field per unit of alpha1, alpha2 and sigma, shape (frames, n, 2, 3)."""
         delta = values["delta"]
         if delta not in self._frames:
             pairs = zip(self.observation.poses, self._tips, strict=True)
@@ -241,7 +241,7 @@ class SplineFields:
         return _Frame(pose, contacts, distance[contacts], None if tip is None else tip.rows, factors)
 
     def _softness(self, places: Floats) -> Floats:
-        """Diagonal that finite stiffness adds at landmarks, in conditioned units."""
+        """Return the diagonal that finite stiffness adds at landmarks, in conditioned units."""
         c = self._scene.components
         if self.model.stiffness is None:
             return np.zeros((c * len(places), c * len(places)))
@@ -275,12 +275,12 @@ class ForceFields:
         self._tip, self._friction = np.stack([u[0] for u in unit]), np.stack([u[1] for u in unit])
 
     def fields(self, values: Mapping[str, float]) -> Floats:
-        """Field per unit of tip force and friction, shape (frames, n, 2, 2)."""
+        """Return the field per unit of tip force and friction, shape (frames, n, 2, 2)."""
         speed = self.observation.remembered_speed(values.get("alpha3", 0.0))
         return np.stack([self._tip, self._friction * speed[:, None, None]], axis=-1)
 
     def _unit(self, pose: NeedlePose) -> tuple[Floats, Floats]:
-        """Fields of 1 N at the tip (none on withdrawal) and of 1 N/mm along the shaft."""
+        """Return the fields of 1 N at the tip (none on withdrawal) and of 1 N/mm along the shaft."""
         points, axis = self.observation.points, np.array(pose.axis)
         zero = np.zeros((len(points), 2))
         if pose.depth < ZERO_LENGTH:

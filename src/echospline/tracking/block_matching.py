@@ -26,7 +26,7 @@ class BlockMatching:
     window : (float, float)
         Block size (lateral, axial), mm.
     search : float
-        Largest motion looked for, each way, mm.
+        Largest motion searched, each way, mm.
     interpolation : int
         Samples per pixel in the interpolated picture; 1 suffers from peak locking.
     """
@@ -42,7 +42,7 @@ class BlockMatching:
             )
 
     def motion(self, before: Frame, after: Frame, points: Floats) -> Motion:
-        """Motion of the tissue at ``points`` (n, 2) mm; confidence is the height of the correlation's peak.
+        """Measure the motion of the tissue at ``points`` (n, 2) mm; confidence is the height of the correlation's peak.
 
         Points whose block or search area leaves the picture, and peaks at the border of the search, have
         confidence 0.
@@ -76,7 +76,7 @@ class BlockMatching:
 
 
 def _vertex(three: NDArray[np.generic]) -> float:
-    """Offset of a parabola's top from the middle of three equidistant samples."""
+    """Return the offset of a parabola's top from the middle of three equidistant samples."""
     left, middle, right = (float(v) for v in three)
     curvature = left - 2.0 * middle + right
     return 0.5 * (left - right) / curvature if curvature < 0 else 0.0

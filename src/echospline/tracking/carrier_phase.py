@@ -1,8 +1,8 @@
-"""Refinement of tracked axial motion by the phase of the carrier, where RF or IQ echoes are there.
+"""Refinement of tracked axial motion by the phase of the carrier, where RF or IQ echoes are available.
 
 The analytic echo of tissue that moved by u satisfies B(p + u) = A(p). Around an estimate u' = u + e, the windowed
 product of B(p + u') with the conjugate of A(p) has the phase 2 pi k e of the axial error e. Laterally there is no
-carrier: a least-squares match of the complex echoes was tried there and did worse than the flow it started from.
+carrier: a least-squares match of the complex echoes was tried and was less accurate than the flow it started from.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ Field = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class CarrierPhase:
-    """Axial correction of an estimate that is right to a quarter of a wavelength.
+    """Axial correction of an estimate within a quarter of a wavelength of the truth.
 
     Parameters
     ----------
     window : float
         Full width at half maximum of the Gaussian window, mm.
     iterations : int
-        Each starts from the last one's result; the second removes most of what strain leaves.
+        Each starts from the result of the one before; the second removes most of the error due to strain.
     """
 
     window: float = 1.5
@@ -46,7 +46,7 @@ class CarrierPhase:
         Returns
         -------
         displacement : ndarray, shape (rows, lines, 2)
-            mm; the lateral part as it came.
+            mm; the lateral part unchanged.
         coherence : ndarray, shape (rows, lines)
             Magnitude of the normalised complex correlation, 0 to 1.
         """
@@ -70,7 +70,7 @@ class CarrierPhase:
 
 
 def taken_back(after: Echo, grid: RegularGrid, u: Field) -> Complexes:
-    """Baseband of ``after`` taken back by ``u``: that of B(p + u(p)) at the samples p of ``grid``."""
+    """Return the baseband of ``after`` taken back by ``u``: that of B(p + u(p)) at the samples p of ``grid``."""
     at = after.grid.to_index(grid.nodes.reshape(*grid.shape[::-1], 2) + u).astype(np.float32)
     x, y = np.ascontiguousarray(at[..., 0]), np.ascontiguousarray(at[..., 1])
     real, imaginary = (

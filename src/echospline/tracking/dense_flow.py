@@ -1,4 +1,4 @@
-"""Displacement from B-mode by dense optical flow: dense inverse search (Kroeger et al. 2016), as OpenCV has it."""
+"""Displacement from B-mode by dense optical flow: dense inverse search (Kroeger et al. 2016), as implemented in OpenCV."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class DenseFlow:
             raise InputError(f"dense flow needs positive patch, stride and iterations; got {self}")
 
     def flow(self, before: Grey, after: Grey) -> PixelField:
-        """Displacement in pixels of every pixel of ``before``.
+        """Compute the displacement in pixels of every pixel of ``before``.
 
         Raises
         ------
@@ -71,5 +71,5 @@ class DenseFlow:
         search.setGradientDescentIterations(self.iterations)
         search.setVariationalRefinementIterations(self.refinements)
         search.setVariationalRefinementAlpha(self.smoothness)
-        # the stub of OpenCV wants the output array that the function allocates itself
+        # the stub of OpenCV requires the output array that the function allocates itself
         return np.asarray(search.calc(before, after, None), dtype=np.float32)  # type: ignore[call-overload]

@@ -1,4 +1,4 @@
-"""Where displacement is measured: a grid over the picture, a fixed region, or one that travels ahead of the tip."""
+"""Points at which displacement is measured: a grid over the picture, a fixed region, or one ahead of the tip."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from echospline.scene import Floats, NeedlePose, RegularGrid
 def grid_over(
     extent: tuple[float, float, float, float], spacing: float, box: Sequence[float] | None = None
 ) -> RegularGrid:
-    """Grid of ``spacing`` mm inside an extent (x0, x1, y0, y1), or inside ``box`` (x0, y0, x1, y1) of it.
+    """Return the grid of ``spacing`` mm inside an extent (x0, x1, y0, y1), or inside ``box`` (x0, y0, x1, y1) of it.
 
     Raises
     ------
@@ -34,7 +34,7 @@ def grid_over(
     nx, ny = (int((b - a) / spacing + 1e-9) + 1 for a, b in ((x0, x1), (y0, y1)))
     if min(nx, ny) < 2 or nx * ny > 4_000_000:
         raise InputError(f"points {spacing:g} mm apart make {nx} x {ny} of them; choose 2 x 2 to 4 million")
-    # centred, so that the margins left over are alike
+    # centred, so that the margins are equal
     origin = x0 + ((x1 - x0) - (nx - 1) * spacing) / 2, y0 + ((y1 - y0) - (ny - 1) * spacing) / 2
     return RegularGrid((nx, ny), (spacing, spacing), origin)
 
@@ -45,7 +45,7 @@ def region_ahead(
     size: tuple[float, float] = (2.0, 3.0),
     shape: tuple[int, int] = (10, 20),
 ) -> Floats:
-    """Points of the paper's region of interest: 200 in 2 x 3 mm, ``distance`` mm ahead of the tip to its centre.
+    """Return the points of the paper's region of interest: 200 in 2 x 3 mm, ``distance`` mm ahead of the tip to its centre.
 
     Raises
     ------
@@ -63,7 +63,7 @@ def region_ahead(
 def inside_ahead(
     points: Floats, pose: NeedlePose, distance: float = 4.0, size: tuple[float, float] = (2.0, 3.0)
 ) -> NDArray[np.bool_]:
-    """Which points lie in the region ahead of the tip, shape (n,); none for a needle without direction."""
+    """Test which points lie in the region ahead of the tip, shape (n,); none for a needle without direction."""
     if pose.depth <= 0:
         return np.zeros(len(points), dtype=np.bool_)
     centre = np.asarray(pose.tip) + distance * np.asarray(pose.axis)

@@ -36,7 +36,7 @@ Reference = Literal["keyframe", "first", "previous"]
 
 @dataclass(frozen=True)
 class Motion:
-    """Displacement of points between two frames and how far it can be trusted.
+    """Displacement of points between two frames, with its confidence.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ class Tracker(Protocol):
     """A method that measures the motion between two frames of one grid."""
 
     def motion(self, before: Frame, after: Frame, points: Floats) -> Motion:
-        """Motion of the tissue that is at ``points`` (n, 2) mm in ``before``."""
+        """Measure the motion of the tissue that is at ``points`` (n, 2) mm in ``before``."""
         ...
 
 
@@ -65,7 +65,7 @@ class Track:
     Parameters
     ----------
     points : ndarray, shape (n, 2)
-        Material points where they are in frame 0, mm.
+        Positions of material points in frame 0, mm.
     times : ndarray, shape (frames,)
         s.
     displacement : ndarray, shape (frames, n, 2)
@@ -85,14 +85,14 @@ class Track:
 
 @dataclass(frozen=True)
 class FlowTracker:
-    """Dense flow, checked by its inverse and by correlation, refined by the carrier where there are echoes.
+    """Dense flow, checked by its inverse and by correlation, refined by the carrier where the frames are echoes.
 
     Parameters
     ----------
     search : DenseFlow
-        Finds the motion.
+        Measures the motion.
     check : DenseFlow or None
-        Finds the way back for the forward-backward test; None skips the test.
+        Measures the reverse motion for the forward-backward test; None skips the test.
     phase : CarrierPhase or None
         Refines the axial part when the frames are `Echo`; None uses their envelope only.
     window : float
@@ -114,7 +114,7 @@ class FlowTracker:
             )
 
     def motion(self, before: Frame, after: Frame, points: Floats) -> Motion:
-        """Motion of the tissue at ``points`` (n, 2) mm; points outside the picture have confidence 0."""
+        """Measure the motion of the tissue at ``points`` (n, 2) mm; points outside the picture have confidence 0."""
         a, b, grid = grey_pair(before, after)
         spacing = np.asarray(grid.spacing, dtype=np.float32)
         u = self.search.flow(a, b) * spacing
@@ -165,8 +165,8 @@ def track(
     needle : sequence of NeedlePose or None, optional
         One per frame: points within ``needle_radius`` mm of the shaft are not tissue and get confidence 0.
     threshold : float
-        Points of lower confidence, and those that disagree with their neighbours, take their neighbours' motion
-        (their confidence says so).
+        Points of lower confidence, and those that disagree with their neighbours, get their neighbours' motion
+        (and a low confidence).
     progress : callable
         Wraps the iteration over frames.
 
@@ -229,7 +229,7 @@ class Neighbours:
 
     @classmethod
     def of(cls, points: Floats, k: int = 8) -> Neighbours:
-        """Find them; fewer than ``k`` where there are fewer points."""
+        """Find the neighbours; fewer than ``k`` where there are fewer points."""
         k = min(k, len(points) - 1)
         if k < 3:
             return cls(np.empty((len(points), 0), dtype=np.intp), np.empty((len(points), 0)))
@@ -240,7 +240,7 @@ class Neighbours:
         """Give outliers and points below the threshold the mean motion of their trusted neighbours.
 
         The test is the normalised median of Westerweel and Scarano (2005), limit 3, with ``floor`` mm added to
-        the spread. Where no neighbour is trusted the measured value stays, with its low confidence.
+        the spread. Where no neighbour is above the threshold, the measured value stays, with its low confidence.
         """
         if self.index.shape[1] == 0:
             return motion
@@ -258,7 +258,7 @@ class Neighbours:
 
 
 def grey_pair(before: Frame, after: Frame) -> tuple[Grey, Grey, RegularGrid]:
-    """Both frames as 8-bit grey pictures of one grid."""
+    """Return both frames as 8-bit grey pictures of one grid."""
     if isinstance(before, Echo) and isinstance(after, Echo):
         grid = picture_grid(before)
         first, second = (_picture(frame, grid) for frame in (before, after))
@@ -278,7 +278,7 @@ def grey_pair(before: Frame, after: Frame) -> tuple[Grey, Grey, RegularGrid]:
 
 
 def picture_grid(echo: Echo) -> RegularGrid:
-    """Square pixels, three to a wavelength (2 / carrier), over the samples of an echo frame."""
+    """Build a grid of square pixels, three to a wavelength (2 / carrier), over the samples of an echo frame."""
     h = 2.0 / echo.carrier / 3.0
     x0, x1, y0, y1 = echo.grid.extent
     return RegularGrid((int((x1 - x0) / h + 1e-9) + 1, int((y1 - y0) / h + 1e-9) + 1), (h, h), (x0, y0))
@@ -294,7 +294,7 @@ def _picture(echo: Echo, grid: RegularGrid) -> Grey:
 
 
 def correlation(a: Grey, b: Grey, u: NDArray[np.float32], window: Floats) -> NDArray[np.float32]:
-    """Normalised cross-correlation of ``a`` with ``b`` taken back by ``u`` (pixels), in a box around every pixel."""
+    """Compute the normalised cross-correlation of ``a`` with ``b`` taken back by ``u`` (pixels), in a box around every pixel."""
     x, y = a.astype(np.float32), _pull(b.astype(np.float32), u)
     size = tuple(int(max(3, round(float(w)))) for w in window)
 
@@ -311,7 +311,7 @@ def correlation(a: Grey, b: Grey, u: NDArray[np.float32], window: Floats) -> NDA
 
 
 def _pull(picture: NDArray[np.float32], u: NDArray[np.float32]) -> NDArray[np.float32]:
-    """``picture`` at every pixel moved by ``u`` pixels."""
+    """Sample ``picture`` at every pixel moved by ``u`` pixels."""
     rows, columns = u.shape[:2]
     x = np.arange(columns, dtype=np.float32)[None, :] + u[..., 0]
     y = np.arange(rows, dtype=np.float32)[:, None] + u[..., 1]
@@ -319,14 +319,14 @@ def _pull(picture: NDArray[np.float32], u: NDArray[np.float32]) -> NDArray[np.fl
 
 
 def regrid(values: NDArray[np.float32], grid: RegularGrid, onto: RegularGrid) -> NDArray[np.float32]:
-    """Values on one grid interpolated (bilinear) to all points of another, image-like."""
+    """Interpolate values on one grid (bilinear) to all points of another, image-like."""
     at = grid.to_index(onto.nodes).astype(np.float32).reshape(*onto.shape[::-1], 2)
     x, y = np.ascontiguousarray(at[..., 0]), np.ascontiguousarray(at[..., 1])
     return np.asarray(cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
 def sample(values: NDArray[np.float32], grid: RegularGrid, points: Floats) -> Floats:
-    """Values on a grid at points in mm (bicubic; the edge's value beyond it), shape (n,) or (n, 2)."""
+    """Sample values on a grid at points in mm (bicubic; the edge's value beyond it), shape (n,) or (n, 2)."""
     at = grid.to_index(points).astype(np.float32)
     found = np.empty((len(points), *values.shape[2:]), dtype=np.float64)
     # OpenCV's maps hold at most 32767 columns

@@ -24,7 +24,7 @@ ABSENT = NeedlePose((0.0, 0.0), (0.0, 0.0), 0.0)
 
 @dataclass(frozen=True)
 class TrackRecord:
-    """Displacement, needle and confidence (frames, n), 1 where the file knows none (a simulation)."""
+    """Displacement, needle and confidence (frames, n), 1 where the file has none (a simulation)."""
 
     motion: DisplacementRecord
     confidence: Floats
@@ -37,7 +37,7 @@ def write_track(path: str | Path, track: Track, poses: Sequence[NeedlePose] | No
     ----------
     path : str or Path
         ``.npz``; or ``.mha``: an image (x, y, frame) of 32-bit vectors (lateral mm, axial mm, confidence) whose
-        header keeps times and needle, for points on a regular grid.
+        header stores times and needle, for points on a regular grid.
     track : Track
     poses : sequence of NeedlePose, optional
         The needle in every frame.
@@ -160,6 +160,6 @@ def _read_vectors(path: Path, limit: float) -> TrackRecord:
         kept.get("entry", zeros).reshape(frames, 2),
         kept.get("speed", np.zeros(frames)),
     )
-    # 32-bit rounding may carry a confidence of 1 beyond it
+    # 32-bit rounding may make a confidence of 1 exceed 1
     confidence = np.minimum(flat[..., 2], 1.0) if flat[..., 2].max(initial=0.0) < 1.0 + 1e-6 else flat[..., 2]
     return TrackRecord(motion, _checked(confidence, path, (frames, nx * ny)))

@@ -29,12 +29,12 @@ IN_FLIGHT = 2
 PLOT_POINTS = 400
 """Points of the summary's plot."""
 FASTEST_DISPLAY, AHEAD = 1 / 60, 0.008
-"""s; a frame is sent this long before the page draws again, as its reports foretell, and not sooner: a snapshot
-sent at once would be old by then, and a second one would have to follow it."""
+"""s; a frame is sent this long before the next refresh of the page (predicted from its reports) and not sooner:
+a snapshot sent at once would be outdated by then, and a second one would have to follow it."""
 STILL, KEEP_ALIVE = 5e-4, 0.1
-"""mm and s: while nothing moves further than that from the picture shown, frames come only this often."""
+"""mm and s: while nothing moves further than that from the picture shown, frames are sent only at this interval."""
 NODES_UP_TO = 4000
-"""Mesh nodes beyond which a spline's weights go out instead, where the model offers them: fitting them takes the
+"""Mesh nodes beyond which a spline's weights are sent instead, where the model offers them: fitting them takes the
 server longer than sending 9.6 kB of 1200 nodes, and less than the 160 kB of 20 000."""
 HISTORY = 50
 """Earlier sessions of the same exercise in the summary."""
@@ -51,7 +51,7 @@ class Training:
 
 
 class Seat:
-    """An engine with what belongs to it; it outlives a reload of its page for a while."""
+    """An engine with its scene and exercise; it is kept for a while after its page closes, so that a reload resumes."""
 
     def __init__(self, scene: Scene, rate: float) -> None:
         self.scene = scene
@@ -60,7 +60,7 @@ class Seat:
         self.model, self.compared = scene.names[0][0], ""
 
     def end_training(self) -> None:
-        """Stop recording, and watching the targets."""
+        """Stop recording and stop watching the targets."""
         if self.training is not None:
             self.engine.unobserve(self.training.recorder)
             self.training = None
@@ -77,7 +77,7 @@ class Client:
     seat : Seat
         The engine; this client runs it while it is connected.
     sessions : Sessions
-        Where finished exercises go.
+        Storage of finished exercises.
     nodes : bool, optional
         Send node displacements even where the model offers a spline; by default up to `NODES_UP_TO` nodes.
     """
@@ -95,7 +95,7 @@ class Client:
         self._credit.set()
 
     async def serve(self, resumed: bool) -> None:
-        """Serve until the page goes or breaks the protocol; the engine's thread ends with it."""
+        """Serve until the page closes or breaks the protocol; the engine's thread ends with it."""
         await self._tell("scene", **self._describe(resumed))
         with Pacer(self.seat.engine):
             tasks = [asyncio.create_task(self._receive()), asyncio.create_task(self._send_frames())]
@@ -298,7 +298,7 @@ class Client:
         slot.call_when_newer(number, wake)
         await here.wait()
         newest = slot.latest()
-        assert newest is not None  # it has just been announced
+        assert newest is not None  # the callback has announced it
         return newest
 
     async def _tell(self, what: str, **content: object) -> None:
@@ -321,7 +321,7 @@ class Client:
 
 
 def is_still(shown: Snapshot, now: Snapshot) -> bool:
-    """Whether a frame of ``now`` would look like that of ``shown``: same needle, tissue within `STILL` mm."""
+    """Test whether a frame of ``now`` would look like that of ``shown``: same needle, tissue within `STILL` mm."""
     same = shown.pose == now.pose and shown.command == now.command and shown.model == now.model
     flags = (shown.frozen, shown.replaying, shown.failure) == (now.frozen, now.replaying, now.failure)
     if not (same and flags and len(shown.watched) == len(now.watched)):
@@ -332,7 +332,7 @@ def is_still(shown: Snapshot, now: Snapshot) -> bool:
 
 
 def resampled(trace: Trace, period: float) -> list[NeedlePose]:
-    """Poses of a trace at an engine's period; unchanged when it is the trace's own."""
+    """Resample the poses of a trace at an engine's period; unchanged when the periods are equal."""
     if len(trace) == 0:
         raise InputError("this session holds no motion")
     if abs(trace.period - period) < 1e-12:
@@ -345,7 +345,7 @@ def resampled(trace: Trace, period: float) -> list[NeedlePose]:
 
 
 def summary_of(number: int, exercise: Exercise, trace: Trace, result: Score) -> dict[str, Any]:
-    """What the page shows at the end, the plots thinned out."""
+    """Build the summary for the page, with few enough points for its plots."""
     if len(trace) == 0:
         rows, distance = np.empty(0, dtype=int), np.empty(0)
     else:

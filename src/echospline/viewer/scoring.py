@@ -1,8 +1,8 @@
-"""Scores of a recorded insertion: the metrics that the Perk Tutor made customary, in the imaging plane.
+"""Scores of a recorded insertion: the metrics of the Perk Tutor, in the imaging plane.
 
 Definitions follow PerkTutor/PythonMetrics where it has them: path inefficiency is 100 (path / straight - 1) per
 cent, tissue damage the area that the shaft sweeps inside the tissue, motion smoothness the root of the
-integral of the squared jerk. Unlike there, the target is where the *deformed* tissue has taken it.
+integral of the squared jerk. Unlike there, the target moves with the *deformed* tissue.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ the rate of the pointer's events instead of the hand."""
 
 @dataclass(frozen=True)
 class Score:
-    """How an exercise went; lengths mm, times s.
+    """Result of an exercise; lengths mm, times s.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ class Score:
     tissue_time : float
         With the needle in the tissue.
     path_length : float
-        Way of the tip inside the tissue.
+        Path length of the tip inside the tissue.
     path_inefficiency : float
         100 (path length / straight way from first entry to last tip - 1), per cent.
     tissue_damage : float
@@ -54,7 +54,7 @@ class Score:
     final_error : float
         Last tip to the deformed target's centre.
     target_shift : float
-        How far the tissue has moved the target at the end.
+        Displacement of the target at the end.
     vessel_contacts : int
         Times the needle touched a vessel.
     """
@@ -73,7 +73,7 @@ class Score:
     vessel_contacts: int
 
     def to_dict(self) -> dict[str, float | int | bool | None]:
-        """Plain values for JSON; an infinite one is None."""
+        """Return plain values for JSON; an infinite one is None."""
         return {k: (None if isinstance(v, float) and not isfinite(v) else v) for k, v in asdict(self).items()}
 
 
@@ -119,7 +119,7 @@ def score(trace: Trace, exercise: Exercise) -> Score:
 
 
 def swept_area(trace: Trace) -> Floats:
-    """Area between the shaft of each row and that of the row before, shape (n - 1,), mm^2.
+    """Return the area between the shaft of each row and that of the row before, shape (n - 1,), mm^2.
 
     A needle that only moves along itself sweeps nothing; the two triangles are those of the quadrilateral
     of old and new entry and tip.
@@ -154,7 +154,7 @@ def redirections(trace: Trace, inside: NDArray[np.bool_]) -> int:
 
 
 def contacts(entry: Floats, tip: Floats, centres: Floats, radius: float, inside: NDArray[np.bool_]) -> int:
-    """How often the shaft begins to touch a disc that moves with the tissue."""
+    """Count how often the shaft begins to touch a disc that moves with the tissue."""
     along = tip - entry
     length2 = np.maximum((along**2).sum(axis=1), 1e-12)
     t = np.clip(((centres - entry) * along).sum(axis=1) / length2, 0.0, 1.0)
@@ -163,7 +163,7 @@ def contacts(entry: Floats, tip: Floats, centres: Floats, radius: float, inside:
 
 
 def smoothness(trace: Trace) -> float:
-    """Root of the integral of the squared jerk of the tip, after averaging over `JERK_INTERVAL`."""
+    """Return the root of the integral of the squared jerk of the tip, after averaging over `JERK_INTERVAL`."""
     rows = max(1, round(JERK_INTERVAL / trace.period))
     blocks = len(trace) // rows
     if blocks < 4:

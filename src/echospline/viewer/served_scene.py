@@ -1,4 +1,4 @@
-"""What a page shows: an image, the models that can deform it, the needle's looks, the exercises."""
+"""The scene of a page: an image, the models that can deform it, the needle's looks, the exercises."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from echospline.scene import NeedlePose, RegularGrid, UltrasoundImage
 from echospline.viewer.exercise import Exercise, check_exercises
 
 LARGEST_SIDE = 4096
-"""Pixels; what every WebGL2 browser takes as a texture is at least 2048, nearly all take this."""
+"""Pixels; every WebGL2 browser accepts textures of 2048, and nearly all accept this."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Scene:
     Parameters
     ----------
     title : str
-        For people.
+        For display.
     image : UltrasoundImage
         At rest.
     grid : RegularGrid
@@ -36,17 +36,17 @@ class Scene:
     models : callable
         From a name to a model.
     names : tuple of (name, label)
-        The models on offer, the first one is the default.
+        The available models; the first one is the default.
     entry : (x, y)
-        Where the needle begins, mm.
+        Point of entry, mm.
     angle : float
         Its direction, degrees from +x towards depth.
     echo : NeedleEcho
         Its looks.
     exercises : tuple of Exercise
-        What can be trained here.
+        The exercises of this scene.
     source : str
-        What this scene was made from, kept with each session so that it can be run again; opaque here.
+        Description of the scene's origin, stored with each session so that it can be run again; not read here.
 
     Raises
     ------
@@ -80,11 +80,11 @@ class Scene:
         return NeedlePose(self.entry, self.entry)
 
     def exercise(self, name: str) -> Exercise | None:
-        """One exercise by name."""
+        """Return the exercise of a name."""
         return next((exercise for exercise in self.exercises if exercise.name == name), None)
 
     def describe(self) -> dict[str, Any]:
-        """Everything the page needs to know besides the pixels, as plain values."""
+        """Return everything that the page needs besides the pixels, as plain values."""
         (columns, rows), spacing, origin = (
             self.image.grid.shape,
             self.image.grid.spacing,
@@ -102,18 +102,18 @@ class Scene:
 
 
 SceneOpener = Callable[[Path, tuple[float, float] | None], Scene]
-"""Makes a scene from an uploaded file and a spacing; passed in, for it knows models."""
+"""Builds a scene from an uploaded file and a spacing; passed in, because it imports models."""
 
 
 def tip_of(entry: tuple[float, float], angle: float, depth: float) -> tuple[float, float]:
-    """Tip of a needle at an entry, mm, in a direction, degrees, inserted so deep, mm."""
+    """Return the tip of a needle from its entry, mm, direction, degrees, and depth, mm."""
     if depth == 0.0:
         return entry
     return (entry[0] + depth * cos(radians(angle)), entry[1] + depth * sin(radians(angle)))
 
 
 def grey_bytes(image: UltrasoundImage) -> bytes:
-    """Pixels as one byte each, row by row: 8-bit ones as they are, colour by its brightness, others scaled."""
+    """Convert pixels to one byte each, row by row: 8-bit unchanged, colour by its brightness, others scaled."""
     pixels: NDArray[Any] = image.pixels
     if pixels.ndim == 3:
         pixels = pixels.astype(np.float64) @ (0.299, 0.587, 0.114)

@@ -29,7 +29,7 @@ from echospline.io.recording import Recording, check_size, decoding, quietly
 from echospline.scene import Floats, Pixels
 
 _DEFERRED = 2**16
-"""Elements longer than this (private data, mostly) stay on the disk."""
+"""Elements longer than this (private data, mostly) are not loaded."""
 
 
 def open_dicom(path: Path, limit: float) -> Recording:
@@ -45,7 +45,7 @@ def open_dicom(path: Path, limit: float) -> Recording:
     Raises
     ------
     InputError
-        If the file is damaged, too large or holds no picture.
+        If the file is damaged, too large or without a picture.
     MissingExtraError
         If its compression needs the extra ``dicom``.
     """
@@ -116,7 +116,7 @@ def open_dicom(path: Path, limit: float) -> Recording:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Pydicom warns and logs every oddity of a header; those that matter here become notes or errors."""
+    """Silence pydicom, which warns and logs every oddity of a header; those that matter become notes or errors."""
     logger = logging.getLogger("pydicom")
     level = logger.level
     logger.setLevel(logging.CRITICAL)
@@ -129,7 +129,7 @@ def _quiet() -> Iterator[None]:
 
 
 def _times(header: pydicom.Dataset, frames: int) -> Floats | None:
-    """Seconds since the first frame from Frame Time Vector, Frame Time (both ms) or a rate."""
+    """Return the seconds since the first frame from Frame Time Vector, Frame Time (both ms) or a rate."""
     vector = header.get("FrameTimeVector")
     if vector is not None and len(np.atleast_1d(vector)) == frames:
         steps = np.array([float(step) for step in np.atleast_1d(vector)]) / 1000.0

@@ -1,4 +1,4 @@
-"""Pixels of a DICOM file: which decoder takes them, and how they are made upright and grey or RGB."""
+"""Pixels of a DICOM file: the choice of a decoder, inversion and palettes."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ PILLOW = (JPEGBaseline8Bit, JPEGExtended12Bit, JPEG2000, JPEG2000Lossless)
 
 
 GDCM = (JPEGLossless, JPEGLosslessSV1, JPEGLSLossless, JPEGLSNearLossless)
-"""Transfer syntaxes by who decodes them."""
+"""Transfer syntaxes by their decoder."""
 
 
 _DEFLATE = 1032
@@ -42,9 +42,9 @@ _DEFLATE = 1032
 
 
 def raw_frames(path: Path, syntax: UID, frame: int | None, mislabelled: bool) -> Iterator[Pixels]:
-    """Frames as pydicom decodes them, read from the disk one by one (a deflated file only as a whole).
+    """Return the frames as pydicom decodes them, read from the disk one by one (a deflated file only as a whole).
 
-    The decoder is named, for pydicom would prefer GDCM where that is installed (see `echospline.io.lossless`).
+    The decoder is named because pydicom prefers GDCM where that is installed (see `echospline.io.lossless`).
     """
     options: dict[str, Any] = {"photometric_interpretation": "YBR_FULL"} if mislabelled else {}
     source: Any = pydicom.dcmread(path) if syntax == DeflatedExplicitVRLittleEndian else path
@@ -53,14 +53,14 @@ def raw_frames(path: Path, syntax: UID, frame: int | None, mislabelled: bool) ->
 
 
 def coloured(indices: Pixels, header: pydicom.Dataset) -> Pixels:
-    """Palette colours as 8-bit RGB; 16-bit entries carry their 8 bits in the upper byte, as displays take them."""
+    """Convert palette colours to 8-bit RGB; 16-bit entries carry their 8 bits in the upper byte, as displays read them."""
     colours: Any = apply_color_lut(indices, header)
     eight: Pixels = (colours >> 8 if colours.max(initial=0) > 255 else colours).astype(np.uint8)
     return eight
 
 
 def check_deflated(path: Path, limit: float) -> None:
-    """Pydicom inflates a deflated file whole, so its size must be bounded before."""
+    """Refuse a deflated file that may inflate beyond the limit: pydicom inflates it whole."""
     meta = pydicom.filereader.read_file_meta_info(path)
     size = path.stat().st_size * _DEFLATE / MIB
     if meta.get("TransferSyntaxUID") == DeflatedExplicitVRLittleEndian and size > limit:
@@ -71,7 +71,7 @@ def check_deflated(path: Path, limit: float) -> None:
 
 
 def check_decoder(path: Path, header: pydicom.Dataset) -> None:
-    """Refuse what cannot be decoded before any pixel is wanted."""
+    """Refuse a compression that cannot be decoded before any pixel is read."""
     syntax = header.file_meta.TransferSyntaxUID
     known = (*PILLOW, *GDCM, RLELossless, DeflatedExplicitVRLittleEndian)
     if syntax.is_compressed and (
@@ -95,14 +95,14 @@ def dtype_of(path: Path, header: pydicom.Dataset) -> np.dtype[Any]:
 
 
 def upright(pixels: Pixels, stored: int) -> Pixels:
-    """MONOCHROME1, whose lowest value is white, the other way round."""
+    """Invert MONOCHROME1, whose lowest value is white."""
     top = 2**stored - 1 if pixels.dtype.kind == "u" else -1
     inverted: Pixels = (top - pixels.astype(np.int64)).astype(pixels.dtype)
     return inverted
 
 
 def is_mislabelled(path: Path, header: pydicom.Dataset) -> bool:
-    """Whether a picture labelled RGB holds JPEG frames in YCbCr, as JFIF frames always are.
+    """Test whether a picture labelled RGB holds JPEG frames in YCbCr, as JFIF frames always are.
 
     The JPEG File Interchange Format (1.02) has no RGB; pydicom goes by the label alone.
     """

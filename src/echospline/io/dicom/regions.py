@@ -20,15 +20,15 @@ _DATA = {1: "tissue", 2: "colour flow", 3: "PW Doppler", 4: "CW Doppler", 0x0A: 
 
 
 _MOST_SHRUNK = 8
-"""How many times smaller than its own regions a picture is taken to be."""
+"""Largest factor by which a picture may be smaller than its regions; regions beyond it are not used."""
 
 
 def regions_of(header: pydicom.Dataset, rows: int, columns: int) -> tuple[tuple[Region, ...], list[str]]:
-    """Ultrasound regions (0018,6011) in pixels of this picture.
+    """Return the ultrasound regions (0018,6011) in pixels of this picture.
 
-    Who shrinks a picture often keeps the regions of the large one: when they reach beyond the picture both ways, the
+    A picture that was shrunk often keeps the regions of the large one: when they reach beyond the picture both ways, the
     smallest whole factor that makes them fit is undone. When they do so one way only, the picture was cut there, and
-    the spacing holds. A note says which was taken.
+    the spacing holds. A note records the choice.
     """
     found = []
     for item in header.get("SequenceOfUltrasoundRegions") or ():
@@ -41,7 +41,7 @@ def regions_of(header: pydicom.Dataset, rows: int, columns: int) -> tuple[tuple[
             found.append(Region((x0, y0, x1 + 1, y1 + 1), _region_spacing(item), content))
     if not found:
         return (), []
-    # The last column is often given as the number of columns: one too many is no other matrix.
+    # The last column is often given as the number of columns: one too many does not mean another matrix.
     across = max((r.box[2] - 1) / columns for r in found)
     down = max((r.box[3] - 1) / rows for r in found)
     notes = []
@@ -93,18 +93,18 @@ def _shrunk(region: Region, factor: int, rows: int, columns: int) -> Region | No
 
 
 def _region_spacing(item: pydicom.Dataset) -> tuple[float, float] | None:
-    """Mm per pixel from Physical Delta X/Y, which are in cm when the units' code is 3."""
+    """Return mm per pixel from Physical Delta X/Y, which are in cm when the units' code is 3."""
     units = (item.get("PhysicalUnitsXDirection"), item.get("PhysicalUnitsYDirection"))
     deltas = (item.get("PhysicalDeltaX"), item.get("PhysicalDeltaY"))
     if units != (_CENTIMETRE, _CENTIMETRE) or None in deltas:
         return None
-    # The sign tells which way the physical axis points, not how large a pixel is.
+    # The sign gives the direction of the physical axis, not how large a pixel is.
     dx, dy = (round(abs(float(delta)) * 10.0, 12) for delta in deltas)
     return (dx, dy) if isfinite(dx) and isfinite(dy) and min(dx, dy) > 0 else None
 
 
 def tissue_of(regions: tuple[Region, ...]) -> Region | None:
-    """Largest 2-D region with lengths; tissue before colour flow before others."""
+    """Return the largest 2-D region with lengths; tissue before colour flow before others."""
     order = {"2-D tissue": 2, "2-D colour flow": 1}
 
     def rank(region: Region) -> tuple[int, int]:
@@ -115,7 +115,7 @@ def tissue_of(regions: tuple[Region, ...]) -> Region | None:
 
 
 def pixel_spacing(header: pydicom.Dataset) -> tuple[float, float] | None:
-    """(lateral, depth) from Pixel Spacing, whose order is rows (depth) first."""
+    """Return (lateral, depth) from Pixel Spacing, whose order is rows (depth) first."""
     shared = header.get("SharedFunctionalGroupsSequence") or [pydicom.Dataset()]
     measures = shared[0].get("PixelMeasuresSequence") or [pydicom.Dataset()]
     value = header.get("PixelSpacing") or measures[0].get("PixelSpacing")
