@@ -1,4 +1,4 @@
-"""``echospline bench``: how fast a step and a frame are on this machine."""
+"""``echospline bench``: time of a step and a frame on this machine."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``echospline study exvivo``: the paper's experiment on a recording, or on a phantom where the truth is known."""
+"""``echospline study exvivo``: the paper's experiment on a recording, or on a phantom with known motion."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def study_exvivo(
     quiet: bool,
     source: str,
 ) -> dict[str, Any]:
-    """Track, fit, test, draw and write the report; returns what ``exvivo.json`` holds."""
+    """Track, fit, test, draw and write the report; returns the content of ``exvivo.json``."""
     wrap: Callable[[Any], Any] = (
         iter
         if quiet
@@ -181,7 +181,7 @@ def _scene(path: Path | None) -> tuple[Scenario, Path]:
 def _fields(
     scene: Scenario, folder: Path, mesh: RegularGrid, kind: str
 ) -> Callable[[Observation], UnitFields]:
-    """Return the model of that name as identification sees it; the laws are those linear in the parameters."""
+    """Build the unit fields of the model of that name; its laws are those linear in the parameters."""
     built = build_model(scene.with_values({**PRINTED, "model.kind": kind}), mesh, folder=folder)
     if isinstance(built, TPSModel):
         return lambda seen: SplineFields(built, seen)

@@ -1,4 +1,4 @@
-"""``echospline info``: what a file holds, before anything is done with it."""
+"""``echospline info``: the content of a file, before anything is done with it."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def info(
 
 
 def describe(file: str, limit: float = LIMIT) -> dict[str, Any]:
-    """Gather what a file holds, in words and numbers that JSON can carry.
+    """Describe the content of a file in values for JSON.
 
     Parameters
     ----------
@@ -175,7 +175,7 @@ def _of_displacement(path: Path, limit: float) -> dict[str, Any]:
 
 
 def _of_toml(path: Path) -> dict[str, Any]:
-    """Describe a scenario; of another TOML file its tables alone."""
+    """Describe a scenario; of another TOML file, list its tables."""
     if path.stat().st_size > LARGEST_FILE:
         raise InputError(f"{path} has {path.stat().st_size:,} bytes; a scenario has {LARGEST_FILE:,} at most")
     try:
@@ -209,7 +209,7 @@ def _size(columns: int, rows: int, spacing: tuple[float, float]) -> list[float]:
 
 
 def _lines(key: str, value: Any) -> list[str]:
-    """Return a value as a person reads it, a line for each thing."""
+    """Return a value as lines of text for display."""
     shown = _SHOWN.get(key)
     return [_short(value)] if shown is None or value is None else shown(value) or ["none"]
 

@@ -1,4 +1,4 @@
-"""``echospline link``: a tracker or 3D Slicer drives the needle over OpenIGTLink and gets the deforming image back."""
+"""``echospline link``: a tracker or 3D Slicer moves the needle over OpenIGTLink and receives the deforming image."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ def link(
             raise InputError(f"a scenario is named NAME.toml, without folders; got {name!r}")
         return make_stage(load(scenarios / name), scenarios, orientation, rate, [])
 
-    # An engine's step is short: more threads make it slower, and late.
+    # An engine's step is short: more threads make it slower and less punctual.
     with threadpool_limits(limits=1), Session(stage, options, load_named if scenarios else None) as session:
         if not quiet:
             where = f"OpenIGTLink on {host}:{session.port}" if serve else "OpenIGTLink"
@@ -186,15 +186,15 @@ def make_stage(
     Parameters
     ----------
     scenario : Scenario
-        What is simulated.
+        The scenario to simulate.
     folder : Path
-        Where its relative paths start.
+        Start of its relative paths.
     orientation : {"MF", "UF", "MN", "UN"}
-        Which way the picture lies in its file.
+        Orientation of the picture in its file.
     rate : float
         Steps per second.
     targets : list of (x, y)
-        Points that are followed, mm.
+        Points whose motion is reported, mm.
     """
     image = oriented(scenario.read_image(folder), orientation)
     grid = scenario.grid(image)
@@ -237,7 +237,7 @@ def _summary(stage: Stage) -> str:
 
 
 def address(text: str) -> tuple[str, int]:
-    """Host and port of ``HOST:PORT``; without a port OpenIGTLink's own.
+    """Split ``HOST:PORT`` into host and port; without a port OpenIGTLink's own.
 
     Raises
     ------

@@ -90,7 +90,7 @@ def live(
     scene = scene_of(scenario, image, folder)
     settings = Settings(host, port, rate, clients, nodes=nodes)
     kept = Sessions(sessions or default_sessions())
-    scene.models(scene.names[0][0])  # refuses what makes no model, and compiles, before a page waits for it
+    scene.models(scene.names[0][0])  # refuses an invalid scenario, and compiles, before a page waits for it
     app = build_app(scene, kept, settings, opener_for(scenario))
     console = Console(stderr=True)
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
@@ -104,7 +104,7 @@ def live(
     with ExitStack() as stack:
         stack.enter_context(
             threadpool_limits(limits=1)
-        )  # an engine's step is short: more threads make it slower, and late
+        )  # an engine's step is short: more threads make it slower and less punctual
         if link or link_connect:
             session = Session(
                 make_stage(scenario, folder, rate=rate),
@@ -165,7 +165,7 @@ def _whole(scenario: Scenario, folder: Path) -> str:
 
 
 def opener_for(scenario: Scenario) -> Callable[[Path, tuple[float, float] | None], Scene]:
-    """Make uploaded images into scenes with the tissue, mesh and model of a scenario."""
+    """Build a function that turns uploaded images into scenes with the tissue, mesh and model of a scenario."""
 
     def opened(path: Path, spacing: tuple[float, float] | None) -> Scene:
         values: dict[str, Any] = {"title": "Your image", "image.file": str(path), "image.spacing": spacing, "image.frame": 0,

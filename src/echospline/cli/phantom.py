@@ -64,7 +64,7 @@ def phantom_into(
     scenario: Scenario, out: Path, folder: Path, *, echoes: bool, rf: bool = False, quiet: bool = True
 ) -> dict[str, Any]:
     """Run a scenario on its phantom; returns the report of `run` with a table ``phantom``."""
-    # the resolved scenario names its own picture, so that simulate and identify find the mesh where it was
+    # the resolved scenario names its own picture, so that simulate and identify use the same mesh
     scenario = scenario.with_values({"image.file": PHANTOM, "image.region": None, "image.spacing": None})
     section, probe = scenario.phantom, scenario.probe.probe()
     scattered = section.phantom(probe)
@@ -105,7 +105,7 @@ def phantom_into(
 
 
 def described(phantom: Phantom, still: Echo) -> dict[str, Any]:
-    """Say what was imaged, and the statistics of its speckle at rest."""
+    """Describe the phantom, and the statistics of its speckle at rest."""
     found = speckle_statistics(still.envelope(), still.grid.spacing)
     return {
         "scatterers": len(phantom.scatterers.amplitudes),

@@ -1,4 +1,4 @@
-"""``echospline recorded``: a tracked procedure, simulated again and compared with what was seen."""
+"""``echospline recorded``: a tracked procedure, simulated again and compared with its pictures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``echospline sessions``: list, export and score again what was trained, and make a cine of it."""
+"""``echospline sessions``: list, export and score training sessions again, and make a cine of one."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ def demo(out: Out = Path("out/demo"), json_: Json = False) -> None:
 
 
 def simulate_into(source: str, out: Path, changes: dict[str, Any], *, as_json: bool) -> None:
-    """Run a scenario with a progress bar on a terminal, and say what came out."""
+    """Run a scenario with a progress bar on a terminal, and print a summary."""
     scenario, folder = scenario_from(source, changes)
     image = scenario.read_image(folder)
     model = build_model(scenario, scenario.grid(image), folder=folder)
@@ -85,7 +85,7 @@ def simulate_into(source: str, out: Path, changes: dict[str, Any], *, as_json: b
 
 
 def _image_former(scenario: Scenario, image: UltrasoundImage) -> ImageFormer | None:
-    """Return what forms the pictures where it is not the warp."""
+    """Return the image former, where it is not the warp."""
     if scenario.output.image_model == "warp":
         return None
     section = scenario.phantom

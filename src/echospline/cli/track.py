@@ -117,7 +117,7 @@ def track(
         progress=wrap,
     )
     if ahead is not None and poses is not None:
-        # outside of the region of its frame a point is not asked for
+        # a point outside the region of its frame is not needed
         here = np.stack([inside_ahead(points, pose, ahead) for pose in poses])
         found = Track(found.points, found.times, found.displacement, found.confidence * here, found.keyframes)
     write_track(out, found, poses)
@@ -205,7 +205,7 @@ def swept(poses: Iterable[NeedlePose], distance: float, grid: RegularGrid) -> Fl
 
 
 def summary(found: Track, seconds: float) -> dict[str, Any]:
-    """Say what was found."""
+    """Print a summary of the motion."""
     trusted = found.confidence >= 0.3
     size = np.hypot(found.displacement[..., 0], found.displacement[..., 1])
     return {
@@ -221,7 +221,7 @@ def summary(found: Track, seconds: float) -> dict[str, Any]:
 
 def draw(frames: Cine | EchoCine, found: Track, poses: list[NeedlePose] | None, path: Path) -> None:
     """Draw the arrows of the frame that moved most over the first picture."""
-    # matplotlib takes long to load
+    # matplotlib is slow to load
     from echospline.picture.summary import tracking_figure  # noqa: PLC0415
 
     grey, _, grid = grey_pair(frames[0], frames[0])

@@ -1,7 +1,7 @@
-"""How well each model answers as finite elements do: the paper's comparison (Fig. 3a), on trajectories not fitted too.
+"""Error of each model against finite elements: the paper's comparison (Fig. 3a), extended to trajectories that were not fitted.
 
 One case is one tissue. Finite elements step the needle through it; the other models are fitted on one oblique
-insertion and judged on it and on others. ``held_out`` says which.
+insertion and evaluated on it and on others, marked ``held_out``.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ HELD_OUT = (((26.0, 0.0), 115.0, 22.0), ((20.0, 0.0), 90.0, 24.0), ((6.0, 0.0), 
 SPEED = 5.0
 """mm/s."""
 ORACLE = 2.1
-"""mm; distance to the needle's axis within which oracle landmarks stand."""
+"""mm; distance to the needle's axis within which nodes are oracle landmarks."""
 PRINTED = TPSParameters(loading="immediate", drag=0.0, tip="point", contact_spacing=0.0)
 """The paper's literal laws, every mesh node a possible contact: the field is linear in the alphas."""
 
@@ -97,7 +97,7 @@ class Case:
 
     @property
     def tissue(self) -> Tissue:
-        """What finite elements are told."""
+        """Tissue of the finite elements."""
         if self.lesion is None:
             return Tissue(self.young)
         x, y, radius, young = self.lesion
@@ -232,7 +232,7 @@ def spline_model(
 def oracle(grid: RegularGrid, seen: Observation, kernel: Kernel) -> Floats:
     """Fit a spline through the truth (the true displacement at every node near the axis, anchors held) and return its fields.
 
-    No law of interaction can do better with these landmarks: what is left is the kernel's own error.
+    No law of interaction can do better with these landmarks: the remaining error is the kernel's own.
     """
     anchors = TPSModel(grid, CLAMPED, PRINTED, kernel).anchors
     inside = np.setdiff1d(np.arange(grid.size), grid.boundary(CLAMPED))
@@ -267,7 +267,7 @@ def discretisation(**arguments: Any) -> dict[str, Any]:
 def brute_force(*, runs: int, frames: int, nodes: Sequence[int], seed: int = 0) -> dict[str, Any]:
     """Compare the paper's grid of whole simulations with the closed form, on the same frames, in one process.
 
-    Seconds are of processor time, so that a busy neighbour does not decide.
+    Seconds are of processor time, so that other processes do not distort the comparison.
     """
     if runs < 8:
         raise InputError(f"a grid needs 8 runs or more; got {runs}")
@@ -324,5 +324,5 @@ def _joint(fields: Sequence[Floats], seen: Sequence[Observation]) -> FieldError:
 
 
 def case_arguments(case: Case) -> dict[str, Any]:
-    """Return the arguments of `accuracy` as JSON holds them."""
+    """Return the arguments of `accuracy` as values for JSON."""
     return asdict(case)

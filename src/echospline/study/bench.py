@@ -1,4 +1,4 @@
-"""How fast a step is on this machine: beside the bare product that is its limit, the display's 60 Hz and the haptic 1 kHz."""
+"""Time of a step on this machine, against the bare product that is its limit, the display's 60 Hz and the haptic 1 kHz."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Row:
     Parameters
     ----------
     name : str
-        What was timed.
+        Name of the timing.
     nodes, landmarks : int
         Of the mesh; moving landmarks (contacts and tip), at the end.
     median_ms, p99_ms : float
@@ -49,12 +49,12 @@ class Row:
     ratio_to_limit: float
 
     def as_json(self) -> dict[str, str | int | float]:
-        """Return the row as JSON carries it."""
+        """Return the row as values for JSON."""
         return asdict(self)
 
 
 def scene(shape: tuple[int, int], kernel: Kernel | None = None) -> TPSModel:
-    """Return the tissue that is measured: 40 x 30 mm, three clamped edges, a contact every millimetre or so."""
+    """Build the tissue for the measurement: 40 x 30 mm, three clamped edges, a contact about every millimetre."""
     grid = RegularGrid(shape, (40.0 / (shape[0] - 1), 30.0 / (shape[1] - 1)))
     return TPSModel(grid, parameters=TPSParameters(delta=1.1, contact_spacing=1.0), kernel=kernel)
 
@@ -104,7 +104,7 @@ def _work(statistics: Statistics) -> int:
 
 
 def bare_product(step: FusedStep, repeats: int = 400) -> float:
-    """Return the median time in ms of the float32 product of the contacts' displacements and their rows: what no step can beat."""
+    """Return the median time in ms of the float32 product of the contacts' displacements and their rows: the lower limit of a step."""
     r, c = step.response, step.response.scene.components
     rows = r.single[r.head : r.head + r.count * c]
     weights = np.ones((2 // c, len(rows)), dtype=np.float32)
@@ -123,7 +123,7 @@ def benchmark(report: Callable[[str], None] = lambda _: None) -> list[Row]:
     Parameters
     ----------
     report : callable
-        Gets a few words before each part.
+        Called with a short text before each part.
     """
     rows: list[Row] = []
     kernels: dict[str, Kernel] = {"": ThinPlate(), "elastic ": Elastic()}

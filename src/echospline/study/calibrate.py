@@ -46,7 +46,7 @@ def calibrate(
     bootstrap: int = 200,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """Identify a model from a displacement record and write what was found.
+    """Identify a model from a displacement record and write the result.
 
     Parameters
     ----------
@@ -55,15 +55,15 @@ def calibrate(
     out : str
         Folder for ``identified.toml`` (a scenario), ``identification.json``, ``error_map.png`` and ``.svg``.
     scenario : str, optional
-        The scene: image, mesh, clamp, tissue; ``scenario.toml`` beside the record when not given.
+        The scene: image, mesh, clamp, tissue; ``scenario.toml`` in the record's folder when not given.
     model : {"tps", "elastic", "green", "fem"}, optional
-        What is identified; the scenario's model when not given.
+        The model to identify; the scenario's when not given.
     objective : {"mae", "rmse"}
-        What is made least.
+        The error to minimise.
     method : {"closed", "grid"}
         Closed form and a small search, or the paper's brute force.
     needle : str, optional
-        Path of the needle (CSV, or the npz of another record) where the record holds none.
+        Path of the needle (CSV, or the npz of another record) where the record has none.
     confidence : float
         Tracked points below this (0 to 1) are left out, frame by frame.
     frames : int
@@ -78,12 +78,12 @@ def calibrate(
     Returns
     -------
     dict
-        What ``identification.json`` holds.
+        The content of ``identification.json``.
 
     Raises
     ------
     InputError
-        If a file or an option is not what it must be.
+        If a file or an option is invalid.
     """
     path = Path(field)
     path = path / "displacement.npz" if path.is_dir() else path
@@ -108,7 +108,7 @@ def calibrate(
         fields = (
             SplineFields(built, seen) if isinstance(built, TPSModel) else ForceFields(_forces(built), seen)
         )
-        with threadpool_limits(limits=1):  # many small products: more threads only wait for each other
+        with threadpool_limits(limits=1):  # many small products: more threads only slow them down
             found = identify(fields, objective, seed=seed, bootstrap=bootstrap)
     else:
         found = grid_search(

@@ -55,7 +55,7 @@ def fields_and_images(
     fields : mapping of str to ndarray, shape (n, 2)
         Displacement by model, mm; ``reference`` among them.
     reference : str
-        Which of them the others are compared with.
+        Name of the field to compare with.
     images : mapping of str to UltrasoundImage
         The image at rest and deformed by each model.
     pose : NeedlePose

@@ -1,4 +1,4 @@
-"""The paper's claims, each against the numbers of a study: under which pairing it holds, and where it does not."""
+"""The paper's claims, each against the numbers of a study: the pairings under which it holds, and those under which it does not."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ Row = Mapping[str, Any]
 
 
 def claims(accuracy: Sequence[Row], savings: Sequence[Row]) -> list[dict[str, str]]:
-    """Judge what the paper says.
+    """Judge the claims of the paper.
 
     Parameters
     ----------

@@ -24,7 +24,7 @@ LAYOUT = 1
 
 @dataclass(frozen=True)
 class Variation:
-    """How far a drawn scenario may lie from its base; pairs are (least, most), drawn evenly.
+    """Ranges of a drawn scenario around its base; pairs are (least, most), drawn evenly.
 
     Parameters
     ----------
@@ -60,12 +60,12 @@ class Variation:
 
 
 def drawn(base: Scenario, index: int, seed: int, frames: int, variation: Variation | None = None) -> Scenario:
-    """Draw sample ``index``: the same for the same base, index and seed, whatever else is made.
+    """Draw sample ``index``: it depends on base, index and seed alone.
 
     Parameters
     ----------
     base : Scenario
-        What is varied.
+        The scenario to vary.
     index, seed : int
     frames : int
         Frames of the sample, evenly over the insertion.
@@ -74,7 +74,7 @@ def drawn(base: Scenario, index: int, seed: int, frames: int, variation: Variati
     Raises
     ------
     InputError
-        If a drawn value is not one that a scenario can have.
+        If a drawn value is not allowed in a scenario.
     """
     v = variation or Variation()
     rng = np.random.default_rng((seed, index))
@@ -116,7 +116,7 @@ def drawn(base: Scenario, index: int, seed: int, frames: int, variation: Variati
 
 
 def create_store(path: Path, base: Scenario, n: int, frames: int, seed: int, sources: Sequence[str]) -> None:
-    """Lay the arrays out, or check that what is there has the same layout; more samples enlarge it.
+    """Create the arrays, or check that existing ones have the same layout; more samples enlarge them.
 
     Raises
     ------
@@ -188,7 +188,7 @@ def make_sample(*, store: str, bases: Sequence[str], index: int, seed: int, fram
 
 
 def imaged(scenario: Scenario, folder: Path) -> dict[str, np.ndarray[Any, Any]]:
-    """Run a scenario on its phantom and keep what a sample holds."""
+    """Run a scenario on its phantom and return the arrays of a sample."""
     phantom = scenario.phantom.phantom(scenario.probe.probe())
     display = scenario.phantom.display()
     blank = UltrasoundImage(np.zeros(phantom.grid.shape[::-1], np.uint8), phantom.grid, "speckle phantom")

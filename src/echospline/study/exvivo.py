@@ -1,8 +1,8 @@
 """The paper's experiment (Figs. 4 and 5): motion tracked ahead of the tip against models that were fitted to it.
 
 A region of 200 points in 2 x 3 mm travels ahead of the tip. At several insertion depths its motion since the first
-frame is tracked; every model is fitted to all of them by least RMSE, compared frame by frame, and the paired test
-asks whether two models differ. A second fit on every other depth predicts the depths between, which it has not seen.
+frame is tracked; every model is fitted to all of them by least RMSE, compared frame by frame, and a paired test
+decides whether two models differ. A second fit on every other depth predicts the depths between, which it does not use.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from echospline.tracking import Tracker, region_ahead, track
 
 Where = Literal["region", "field"]
 Fields = Callable[[Observation], UnitFields]
-"""A model as identification sees it, for an observation."""
+"""Builds a model's unit fields for an observation."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Regions:
     Parameters
     ----------
     frames : tuple of int
-        Which frames of the cine were used, k of them.
+        The k frames of the cine that were used.
     times : ndarray, shape (k,)
         s.
     poses : tuple of NeedlePose
@@ -47,7 +47,7 @@ class Regions:
     grid : RegularGrid
         Of the coarse points.
     map : ndarray, shape (k, grid.size, 2)
-        Their tracked displacement, nan where it is not trusted, mm.
+        Their tracked displacement, nan where the confidence is too low, mm.
     """
 
     frames: tuple[int, ...]
@@ -97,7 +97,7 @@ def regions(
         The needle, on the cine's clock and coordinates.
     tracker : Tracker
     depths : int
-        How many frames are used.
+        Number of frames used.
     shallowest : float
         Depth of the first one, mm.
     distance : float
@@ -198,7 +198,7 @@ def fit(
     fields : callable
         The model.
     where : {"region", "field"}
-        Fitted to the region ahead of the tip, as in the paper, or to all that was tracked. Errors are of the region
+        Fitted to the region ahead of the tip, as in the paper, or to all tracked points. Errors are of the region
         in either case.
     truth : sequence of Displacement, optional
         True displacement at each of the depths' frames.
@@ -254,7 +254,7 @@ def _rmse(u: Floats, seen: Regions, i: int) -> float:
 def paired(a: Floats, b: Floats) -> dict[str, Any]:
     """Test whether two models' RMSE per frame differ: paired t test, Wilcoxon's signed ranks, 95 % interval of the mean.
 
-    A large p does not show that they are the same; the interval says how far apart they may be.
+    A large p does not show that they are the same; the interval bounds their difference.
     """
     d = np.asarray(a) - np.asarray(b)
     n = len(d)

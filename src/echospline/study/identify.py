@@ -1,7 +1,7 @@
-"""Identification: parameters that make a tissue model answer as the tissue did, with what the data cannot tell.
+"""Identification: parameters with which a tissue model fits observed displacements, and the limits of the data.
 
 Linear parameters are solved for, in closed form (least squares, RMSE) or by iteratively reweighted least squares
-(least sum of distances, MAE); only the rest is searched. The paper's brute force is here as `grid_search`.
+(least sum of distances, MAE); only the others are searched. `grid_search` is the paper's brute force.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from echospline.study.unit_fields import UnitFields
 Objective = Literal["mae", "rmse"]
 
 CONFOUNDED = 30.0
-"""Condition number of the scaled Jacobian above which parameters count as not told apart (Belsley et al. 1980)."""
+"""Condition number of the scaled Jacobian above which parameters count as confounded (Belsley et al. 1980)."""
 
 
 @dataclass(frozen=True)
 class Identification:
-    """What was found, how well it fits and how sure it is.
+    """Parameters found, their fit and their uncertainty.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class Identification:
     condition : float
         Condition number of the Jacobian with unit columns: above `CONFOUNDED`, see ``confounded``.
     confounded : tuple of str
-        One sentence per combination of parameters that the data cannot tell.
+        One sentence per combination of parameters that the data do not determine.
     error_map : ndarray, shape (n,)
         Mean distance per point over the frames, mm; nan where a point was never tracked.
     field : ndarray, shape (frames, n, 2)
@@ -86,14 +86,14 @@ def identify(
     seed : int
         Of the starting points of the search and the bootstrap.
     starts : int
-        How many of the best places of a coarse look over all levels are followed down.
+        Number of the best points of a coarse search over all levels from which the descent starts.
     bootstrap : int
-        Resamples of the frames for the intervals; 0 leaves them out.
+        Resamples of the frames for the intervals; 0 for none.
 
     Raises
     ------
     InputError
-        If the observation moves no point that the model could explain.
+        If the observation moves no point that the model can move.
     """
     if objective not in ("mae", "rmse"):
         raise InputError(f'objective is "mae" or "rmse"; got {objective!r}')
@@ -110,7 +110,7 @@ def identify(
         dict(zip(fields.levels, map(float, chosen), strict=True))
         for chosen in product(*fields.levels.values())
     ]
-    # A coarse look everywhere by least squares, which is cheapest; then down from the best few places.
+    # A coarse search by least squares, which is cheapest; then a descent from the best few points.
     places = qmc.Sobol(len(names), seed=seed).random_base2(2 + len(names)) if names else np.zeros((1, 0))
     looked = [(problem.solve(theta(level, z), "rmse")[1], level, z) for level in levels for z in places]
     looked.sort(key=lambda look: look[0])
@@ -231,8 +231,8 @@ class _Problem:
     ) -> tuple[dict[str, float], float]:
         """Find the best linear parameters for given others, and the objective there, mm.
 
-        How the tip's push fades near surfaces depends on sigma itself: the last sigma found stands in for it, and
-        ``exact`` repeats until it is the same.
+        The fading of the tip's push near surfaces depends on sigma itself: the last sigma found is used for it, and
+        ``exact`` repeats until it no longer changes.
         """
         names = list(self.fields.linear)
         for _ in range(20 if exact else 1):
@@ -272,7 +272,7 @@ class _Problem:
         return x
 
     def confounded(self, A: Floats, values: Mapping[str, float]) -> tuple[float, tuple[str, ...]]:
-        """Condition of the Jacobian with unit columns, and what its small singular vectors say."""
+        """Return the condition of the Jacobian with unit columns, and one sentence per small singular vector."""
         names = list(self.fields.linear)
         J = A[self.seen].reshape(-1, len(names))
         norm = np.sqrt((J**2).sum(axis=0))

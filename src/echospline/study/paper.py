@@ -42,17 +42,17 @@ READINGS: Mapping[str, Mapping[str, float]] = {
     "read as 10, 8, 5, 1 kPa": {"10^4": 10.0, "8^4": 8.0, "5^4": 5.0, "10^3": 1.0},
     "as printed": {"10^4": 10.0, "8^4": 8.0**4 / 1000, "5^4": 5.0**4 / 1000, "10^3": 1.0},
 }
-"""Young's moduli in kPa by what the paper prints in Pa: read as slips for 10, 8, 5, 1 x 10^3, and literally."""
+"""Young's moduli in kPa, from the paper's values in Pa: read as slips for 10, 8, 5, 1 x 10^3, and literally."""
 
 FRICTION = 1e-3
-"""N s/mm^2; friction that is felt (0.13 N at 5 mm/s and 26 mm), beside the paper's, which is not."""
+"""N s/mm^2; friction with a noticeable force (0.13 N at 5 mm/s and 26 mm), in addition to the paper's, which is negligible."""
 LESION = (24.0, 17.0, 6.0, 50.0)
 """Centre (mm), radius (mm) and modulus (kPa) of the stiff lesion, five times its surroundings."""
 
 
 @dataclass(frozen=True)
 class Extent:
-    """How much of the study is run.
+    """Extent of a study.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def study(
     Parameters
     ----------
     out : Path
-        Folder; accuracy cases that are there already are not run again.
+        Folder; accuracy cases with results in it are not run again.
     extent : Extent
         `FULL` or `QUICK`.
     seed : int
@@ -115,9 +115,9 @@ def study(
     image : str
         Ultrasound image of Fig. 2.
     command : str
-        How this run was asked for, for the report.
+        Command line of this run, for the report.
     report : callable, optional
-        Told what is being done.
+        Called with a description of each part.
 
     Returns
     -------
@@ -197,7 +197,7 @@ def figure_3a(out: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _task(kind: str, **arguments: Any) -> dict[str, Any]:
-    """Run one case on whichever worker, on one thread like the rest."""
+    """Run one case in a worker, on one thread like all others."""
     with threadpool_limits(limits=1):
         return discretisation(**arguments) if kind == "mesh" else accuracy(**arguments)
 
@@ -216,7 +216,7 @@ def _tasks(extent: Extent, seed: int) -> list[Task]:
 
 
 def _table(results: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Flatten rows; the four moduli appear under each reading of what the paper prints."""
+    """Flatten rows; the four moduli appear under each reading of the paper's values."""
     rows = []
     plain = [row for result in results.values() for row in result["rows"]]
     for reading, moduli in READINGS.items():
@@ -272,7 +272,7 @@ _SPEED = {
 def _report(out: Path, result: Mapping[str, Any], extent: Extent, command: str) -> None:
     seen: set[tuple[Any, ...]] = set()
     rows = []
-    for row in result["accuracy"]:  # 10 and 1 kPa belong to both readings; once is enough to read
+    for row in result["accuracy"]:  # 10 and 1 kPa belong to both readings; they are listed once
         key = tuple(row[k] for k in ("case", "model", "kernel", "how", "held_out"))
         if key not in seen:
             seen.add(key)

@@ -1,4 +1,4 @@
-"""One self-contained HTML page: a study that a person can read and send."""
+"""One self-contained HTML page: the report of a study."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ code { background: #f2f2f2; padding: 0 .25rem; }
 
 
 def table(rows: Sequence[Mapping[str, Any]], columns: Mapping[str, str]) -> str:
-    """Lay rows out as an HTML table.
+    """Return rows as an HTML table.
 
     Parameters
     ----------
@@ -39,14 +39,14 @@ def table(rows: Sequence[Mapping[str, Any]], columns: Mapping[str, str]) -> str:
 
 
 def figure(path: Path, caption: str) -> str:
-    """Embed a picture, so that the page needs no other file."""
+    """Return a picture embedded in HTML, so that the page needs no other file."""
     data = base64.b64encode(path.read_bytes()).decode("ascii")
     source = f"data:{_KINDS[path.suffix]};base64,{data}"
     return f'<figure><img src="{source}" alt="{escape(caption, quote=True)}"><figcaption>{escape(caption)}</figcaption></figure>'
 
 
 def paragraph(text: str) -> str:
-    """Wrap plain text."""
+    """Return plain text as a paragraph of HTML."""
     return f"<p>{escape(text)}</p>"
 
 

@@ -1,9 +1,9 @@
 """Time of one needle step against mesh nodes (the paper's Fig. 3b), with every method named.
 
 One process, one thread, one machine, one scene; the methods take turns at each mesh, so that ratios are of one run.
-Wall-clock and processor time are both kept: they agree on an idle machine, and on a busy one the wall clock also times the
-neighbours, so savings are of processor time.
-A step is what a simulator must do between two poses of the needle: from the pose to the displacement of all nodes.
+Wall-clock and processor time are both kept: they agree on an idle machine, and on a busy one the wall clock includes
+other processes, so savings are of processor time.
+A step is the work between two poses of the needle: from the pose to the displacement of all nodes.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Build = Callable[[RegularGrid, Sequence[NeedlePose]], Step]
 
 FORCES = NeedleForces(0.4, 1e-8, ramp=0.0)
 LANDMARKS = TPSParameters(loading="immediate", drag=0.0, tip="point")
-"""Landmarks stand for tissue, not for pixels: about 1.25 mm apart on every mesh."""
+"""Landmarks represent tissue, not pixels: they are about 1.25 mm apart on every mesh."""
 
 
 @dataclass(frozen=True)
@@ -49,15 +49,15 @@ class Method:
     Parameters
     ----------
     name : str
-        As tables and figures show it.
+        Name in tables and figures.
     family : {"fem", "tps", "green"}
-        Which model.
+        Family of the model.
     build : callable
         Set-up for one mesh; returns the step.
     most_nodes : int
         Larger meshes are left out: a step would take minutes.
     paper : bool
-        Whether this is what the paper's own words describe.
+        Whether the paper itself describes this method.
     """
 
     name: str
@@ -178,7 +178,7 @@ def speed(
     literal_nodes : int
         Largest mesh for the literal algorithm, whose inverse grows with the cube.
     report : callable, optional
-        Told what is measured next.
+        Called with the name of the next measurement.
 
     Returns
     -------

@@ -1,7 +1,7 @@
-"""A sweep: many independent tasks, in this process, on several or on a cluster; every result is on disk at once.
+"""A sweep: many independent tasks, in this process, on several or on a cluster; every result is written at once.
 
-One task, one file: a result is written whole under its final name as soon as it is known, so an interrupted sweep
-resumes where it stopped and a worker that dies loses nothing but the task it held, which runs again elsewhere.
+One task, one file: a result is written whole under its final name as soon as the task ends, so an interrupted sweep
+resumes where it stopped, and after the death of a worker only its current task runs again.
 """
 
 from __future__ import annotations
@@ -49,16 +49,16 @@ class Task:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a sweep came to.
+    """Results of a sweep.
 
     Attributes
     ----------
     results : dict
         Result of each task by name, in the order of the tasks; failed ones are missing.
     failed : dict
-        What went wrong, by name.
+        Error messages by name.
     resumed : int
-        How many results were on disk before.
+        Number of results that were on disk before.
     """
 
     results: dict[str, Result]
@@ -80,7 +80,7 @@ def sweep(
     Parameters
     ----------
     function : callable
-        Importable (defined in a module); takes a task's arguments by keyword, returns what JSON can hold.
+        Importable (defined in a module); takes a task's arguments by keyword, returns values for JSON.
     tasks : sequence of Task
         With distinct names. A task whose file holds a result for the same arguments is not run again.
     out : Path
@@ -91,7 +91,7 @@ def sweep(
         Address of a running dask scheduler, ``tcp://host:8786``; its workers must see the same files and have
         echospline installed.
     report : callable, optional
-        Told the name of each task that ends.
+        Called with the name of each task that ends.
 
     Raises
     ------
@@ -196,7 +196,7 @@ def _keep(task: Task, result: Result, out: Path) -> Result:
 
 
 def _on_disk(task: Task, out: Path) -> Result | None:
-    """Return the result of an earlier run with the same arguments; a file of anything else is not taken for one."""
+    """Return the result of an earlier run with the same arguments; None for any other file."""
     path = out / f"{task.name}.json"
     try:
         whole = json.loads(path.read_text(encoding="utf-8"))

@@ -1,8 +1,8 @@
-"""Fields per unit of each parameter: the tissue models' answer where it is linear, for identification in closed form.
+"""Fields per unit of each parameter: the linear part of the tissue models, for identification in closed form.
 
 Under the printed laws (loading at once, no sideways drag) the field of a needle step is linear in alpha1, alpha2 and,
 but for the fading of the tip's push near surfaces, in sigma (spline); in the tip's force and the friction
-coefficient (finite elements, Green's function). What is not linear (delta, length, alpha3, radius) is searched.
+coefficient (finite elements, Green's function). The nonlinear parameters (delta, length, alpha3, radius) are searched.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from echospline.scene import ZERO_LENGTH, Floats, NeedlePose
 
 @dataclass(frozen=True)
 class Observation:
-    """Displacements seen while a needle moved.
+    """Displacements observed while a needle moved.
 
     Parameters
     ----------
@@ -84,11 +84,11 @@ class Observation:
 
 
 class UnitFields(Protocol):
-    """A tissue model as identification sees it."""
+    """Interface of a tissue model for identification."""
 
     @property
     def observation(self) -> Observation:
-        """What is to be explained."""
+        """The observation to fit."""
         ...
 
     @property
@@ -103,7 +103,7 @@ class UnitFields(Protocol):
 
     @property
     def levels(self) -> Mapping[str, Sequence[float]]:
-        """Further parameters of which a few values are tried."""
+        """Further parameters, each with a few values to try."""
         ...
 
     def fields(self, values: Mapping[str, float]) -> Floats:
@@ -113,7 +113,7 @@ class UnitFields(Protocol):
 
 @dataclass(frozen=True)
 class _Tip:
-    """What one frame's tip adds: its response at the points, at the candidates for contact, and at itself."""
+    """Contribution of one frame's tip: its response at the points, at the candidates for contact, and at itself."""
 
     rows: Floats
     coupling: Floats
@@ -137,7 +137,7 @@ class SplineFields:
     Parameters
     ----------
     model : TPSModel
-        Grid, clamp, kernel, stiffness and the parameters that stay; its laws must be the printed ones.
+        Grid, clamp, kernel, stiffness and the fixed parameters; its laws must be the printed ones.
     observation : Observation
         What is to be explained.
     delta : sequence of float
@@ -226,12 +226,12 @@ class SplineFields:
         return _Tip(self._scene.rows(x), self._scene.between(candidates, x), own)
 
     def _frame(self, pose: NeedlePose, tip: _Tip | None, delta: float) -> _Frame:
-        """Choose the contacts as the model does, and factor their coupling."""
+        """Choose the contacts by the model's rule, and factor their coupling."""
         distance = pose.closest(self._nodes)[1]
         along = (self._nodes - pose.entry) @ np.array(pose.axis)
         touched = (distance <= delta) & (along <= pose.depth - self.model.gap) & (pose.depth >= ZERO_LENGTH)
         if tip is not None:
-            touched &= np.hypot(*(self._nodes - pose.tip).T) > 1e-6  # a tip on a node speaks for it
+            touched &= np.hypot(*(self._nodes - pose.tip).T) > 1e-6  # a tip on a node replaces it as landmark
         contacts = np.flatnonzero(touched)
         index = _interleaved(contacts, self._scene.components)
         G = self._among[np.ix_(index, index)]
@@ -257,7 +257,7 @@ def _interleaved(index: NDArray[np.intp], c: int) -> NDArray[np.intp]:
 class ForceFields:
     """Fields of a `FEMModel` or `GreenModel` per N of tip force and per N s/mm^2 of friction.
 
-    Only forces over modulus can be seen in displacements: the model's Young's modulus is taken as known.
+    Displacements depend on forces over modulus only: the model's Young's modulus is taken as given.
     """
 
     def __init__(
