@@ -1,11 +1,11 @@
 """echospline: how an ultrasound image deforms while a needle is pushed into the tissue, in real time.
 
-The paper's equations, and where they live:
+The paper's equations and their code:
 
 ========  ================================================================  ==========================================
-equation  says                                                              code
+equation  content                                                           code
 ========  ================================================================  ==========================================
-(1)       bending energy that the spline makes least                        `mechanics.spline.Spline.energy`
+(1)       bending energy that the spline minimises                          `mechanics.spline.Spline.energy`
 (2) (9)   g = a0 + a1 x + a2 y + sum w_i U(r_i)                             `mechanics.spline.Spline.__call__`
 (3) (4)   U(r) = r^2 ln r^2, matrix K                                       `mechanics.kernels.ThinPlate`
 (5) (6)   R, and L = [K R; R' 0]                                            `mechanics.spline.factor`

@@ -39,8 +39,8 @@ def dataset(
     """Draw insertions and image them: pictures, true displacement, needle mask and pose, one chunk per sample.
 
     Tissue, probe, needle path and speckle are drawn around the bases; sample i depends on its base, i and the seed alone,
-    and `scenarios/0000000.toml` makes it again (`echospline phantom`). A run that was interrupted goes on where it
-    stopped, and a larger --n adds samples.
+    and `scenarios/0000000.toml` makes it again (`echospline phantom`). An interrupted run resumes,
+    and a larger --n adds samples.
     """
     with as_file(files("echospline").joinpath("data", "dataset.toml")) as own:
         bases = [str(path.resolve()) for path in scenarios or [own]]

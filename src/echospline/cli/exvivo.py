@@ -89,8 +89,8 @@ def exvivo(
     """Repeat the paper's ex-vivo protocol (Figs. 4 and 5).
 
     The motion of 200 points in 2 x 3 mm ahead of the tip is tracked at several depths; thin plate spline, elastic kernel
-    and finite elements are fitted to it separately (RMSE), compared frame by frame with a paired test, and asked to
-    predict depths that they were not fitted to. On the phantom the truth is known: the tracker's own error stands beside.
+    and finite elements are fitted to it separately (RMSE), compared frame by frame with a paired test, and used to
+    predict depths outside the fit. On the phantom the truth is known, and the tracker's own error is reported too.
     """
     if (cine is None) != (needle is None):
         raise InputError("--cine and --needle belong together: where the needle is in every frame")
@@ -116,7 +116,7 @@ def exvivo(
         json.dump(result, sys.stdout, indent=1)
         print()
         return
-    _tell(result, out)
+    _print_summary(result, out)
 
 
 def study_exvivo(
@@ -311,7 +311,7 @@ def _summary(means: Mapping[str, float]) -> list[dict[str, Any]]:
     return rows
 
 
-def _tell(result: Mapping[str, Any], out: Path) -> None:
+def _print_summary(result: Mapping[str, Any], out: Path) -> None:
     console = Console()
     means = result["means"]
     for title, numbers in (

@@ -47,7 +47,7 @@ def info(
         ),
     ] = LIMIT,
 ) -> None:
-    """Say what a file holds: format, pixels, spacing, size in mm, frames and times, and what to doubt."""
+    """Describe a file: format, pixels, spacing, size in mm, frames and times, and doubts."""
     found = describe(file, limit)
     if as_json:
         print(json.dumps(found, indent=2))

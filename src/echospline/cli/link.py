@@ -72,7 +72,7 @@ def link(
         str, typer.Option(metavar="AXIS", help="direction of insertion in that frame: x, -x, y, -y, z, -z")
     ] = "z",
     reference: Annotated[
-        str, typer.Option(metavar="FRAME", help="frame that everything is told in")
+        str, typer.Option(metavar="FRAME", help="frame of all positions sent")
     ] = "Reference",
     image_name: Annotated[
         str, typer.Option(metavar="NAME", help="device name and frame of the image")

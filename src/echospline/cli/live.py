@@ -83,7 +83,7 @@ def live(
     """Steer the needle in the browser and see the tissue move.
 
     Starts a server on this machine and opens its page; Ctrl+C ends it. Without an argument it shows the image that ships
-    inside. Finished exercises are kept (`echospline sessions` lists and exports them).
+    with the package. Finished exercises are kept (`echospline sessions` lists and exports them).
     """
     scenario, folder = scenario_from(source, changes or {})
     image = scenario.read_image(folder)

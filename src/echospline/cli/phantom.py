@@ -40,9 +40,9 @@ def phantom(
 ) -> None:
     """Image a phantom of point scatterers while a needle deforms it.
 
-    The tissue model of the scenario moves the scatterers, and every frame is imaged anew: speckle decorrelates as in
+    The tissue model of the scenario moves the scatterers, and every frame is formed from them: speckle decorrelates as in
     tissue. Writes the cine, `displacement.npz` (the true motion), `echoes.npz` (for `track`), `summary.png`,
-    `scenario.toml` and `run.json`. The tables [probe] and [phantom] say what is imaged and how.
+    `scenario.toml` and `run.json`. The tables [probe] and [phantom] describe probe and phantom.
     """
     if not source.lower().endswith(".toml"):
         raise InputError(

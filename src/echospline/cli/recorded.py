@@ -54,7 +54,7 @@ def recorded(
 
     The first good frame is the tissue at rest, the tracked transforms are the needle's path; model and mesh come from the
     options. Writes `resimulated.igs.mha` and `comparison.csv`: for each frame the correlation of the recorded picture with
-    the simulated one, and with the first frame (what one gets by doing nothing).
+    the simulated one, and with the first frame (the result without a simulation).
     """
     scenario, folder = scenario_from(str(file), changes or {})
     sequence = read_sequence(file)

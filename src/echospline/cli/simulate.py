@@ -41,13 +41,13 @@ def simulate(
 
     Writes the cine, `displacement.npz` (the true motion), `summary.png`, `scenario.toml` (the run, resolved: running it
     again gives the same numbers) and `run.json` (parameters, versions, time per stage) into the folder. Options
-    replace what the scenario says.
+    replace values of the scenario.
     """
     simulate_into(source, out, changes or {}, as_json=json_)
 
 
 def demo(out: Out = Path("out/demo"), json_: Json = False) -> None:
-    """Run the main job on the image that ships inside: a needle into calf muscle, in and out again."""
+    """Run the main job on the image that ships with the package: a needle into calf muscle, in and out again."""
     with as_file(files("echospline").joinpath("data", "demo.toml")) as scenario:
         simulate_into(str(scenario), out, {}, as_json=json_)
 
@@ -81,7 +81,7 @@ def simulate_into(source: str, out: Path, changes: dict[str, Any], *, as_json: b
         json.dump(report, sys.stdout, indent=2)
         print()
         return
-    _tell(report, out)
+    _print_summary(report, out)
 
 
 def _image_former(scenario: Scenario, image: UltrasoundImage) -> ImageFormer | None:
@@ -94,7 +94,7 @@ def _image_former(scenario: Scenario, image: UltrasoundImage) -> ImageFormer | N
     )
 
 
-def _tell(report: dict[str, Any], out: Path) -> None:
+def _print_summary(report: dict[str, Any], out: Path) -> None:
     console = Console()
     table = Table(title=f"{report['frames']} frames in {report['seconds']:.1f} s", title_justify="left")
     table.add_column("stage")

@@ -25,7 +25,7 @@ class Mp4Encoder:
     """H.264 frames into a fragmented MP4, so that the file can be played at any moment.
 
     Finishing copies the packets into a plain MP4 with its index in front (no second encoding), so that a browser
-    knows the duration and starts at once.
+    reads the duration and starts at once.
 
     Parameters
     ----------

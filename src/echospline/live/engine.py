@@ -62,7 +62,7 @@ class LiveEngine:
     name : str
         The first model.
     home : NeedlePose
-        Where the needle begins and where `reset` takes it; usually of zero depth.
+        First pose of the needle, to which `reset` returns it; usually of zero depth.
     rate : float
         Steps per second.
     lag : float

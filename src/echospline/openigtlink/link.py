@@ -68,7 +68,7 @@ class Link:
         self._received, self._status = received, status
         self.limits = limits or LinkLimits()
         self.peers: list[Peer] = []
-        self.farewells: list[tuple[str, str]] = []
+        self.departures: list[tuple[str, str]] = []
         """Name and reason of the last hundred closed connections."""
         self._newest: dict[Key, Outgoing] = {}
         self._servers: list[asyncio.Server] = []
@@ -109,7 +109,7 @@ class Link:
         outgoing = Outgoing(message)
         self._newest[outgoing.key] = outgoing
         for peer in list(self.peers):
-            if outgoing.key not in peer.speaks:
+            if outgoing.key not in peer.sends:
                 peer.offer(outgoing)
 
     async def close(self) -> None:
@@ -155,7 +155,7 @@ class Link:
     def _leave(self, peer: Peer, reason: str) -> None:
         if peer in self.peers:
             self.peers.remove(peer)
-        self.farewells = [*self.farewells[-99:], (peer.name, reason)]
+        self.departures = [*self.departures[-99:], (peer.name, reason)]
         log.info(
             "%s left: %s (%d received, %d sent, %d skipped)",
             peer.name, reason, peer.messages, peer.sent, peer.skipped,

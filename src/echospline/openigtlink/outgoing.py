@@ -55,7 +55,7 @@ def draw(
     visible : Visible or None
         The piece of the needle inside the beam.
     looks : Looks
-        How it is told.
+        Naming and looks.
     """
     picture = warp(image, Deformation(grid, snapshot.displacement))
     if looks.echo is not None and visible is not None:
@@ -82,7 +82,7 @@ def image_message(
     plane : ImagingPlane
         Their plane.
     looks : Looks
-        How it is told.
+        Naming and looks.
     now : float
         Seconds since 1970.
     """

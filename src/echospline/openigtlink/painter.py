@@ -1,4 +1,4 @@
-"""Pictures of a session: what is drawn again, and which messages are due."""
+"""Pictures of a session, drawn again when the scene changes, and the messages that are due."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Painter:
     reach : Reach
         Distances up to which the needle is seen.
     rates : Rates
-        How often meshes and statuses are sent.
+        Rates of meshes and statuses.
     """
 
     def __init__(self, looks: Looks, reach: Reach, rates: Rates) -> None:

@@ -99,8 +99,8 @@ class Peer(asyncio.Protocol):
         """Header version sent to it: 1 until it sends version 2."""
         self.muted: set[str] = set()
         """Types that it asked not to receive (STP_)."""
-        self.speaks: set[Key] = set()
-        """What it sends itself."""
+        self.sends: set[Key] = set()
+        """Type and device of the messages that it sends."""
         self.messages = 0
         """Messages received."""
         self.sent = 0
@@ -139,7 +139,7 @@ class Peer(asyncio.Protocol):
         self._flush()
 
     def close(self, reason: str, *, politely: bool = False) -> None:
-        """End the connection; ``politely`` sends what waits first."""
+        """End the connection; ``politely`` sends waiting messages first."""
         if self._transport is None:
             return
         self._reason = self._reason or reason
@@ -224,16 +224,16 @@ class Peer(asyncio.Protocol):
         self.version = max(self.version, min(message.version, 2))
         content = message.content
         if isinstance(content, Unread):
-            self._complain(message, "passed over", content.reason or "echospline does not know this type")
+            self._log_once(message, "passed over", content.reason or "echospline does not know this type")
             return
-        if len(self.speaks) < 1000:
-            self.speaks.add((message.type, message.device))
+        if len(self.sends) < 1000:
+            self.sends.add((message.type, message.device))
         try:
             self._received(self, message)
         except InputError as error:
-            self._complain(message, "refused", str(error))
+            self._log_once(message, "refused", str(error))
 
-    def _complain(self, message: Message, fate: str, reason: str) -> None:
+    def _log_once(self, message: Message, fate: str, reason: str) -> None:
         """Log once per reason: a tracker repeats the same fault a thousand times a second."""
         if (message.type, reason) not in self._complained and len(self._complained) < 100:
             self._complained.add((message.type, reason))

@@ -73,7 +73,7 @@ class Session:
         self._located = self._tracking.locate()
         self._link = Link(self._received, self.status, self.options.limits)
         self._threads = [
-            threading.Thread(target=self._talk, name="echospline-link", daemon=True),
+            threading.Thread(target=self._run_link, name="echospline-link", daemon=True),
             threading.Thread(target=self._draw, name="echospline-picture", daemon=True),
         ]
 
@@ -117,16 +117,16 @@ class Session:
         return self._stage.engine
 
     def status(self) -> Status:
-        """Answer to GET_STATUS: the needle, the model, what is wrong."""
+        """Return the answer to GET_STATUS: the needle, the model and faults."""
         newest = self._stage.engine.snapshots.latest()
         assert newest is not None  # an engine begins with one
         return status_of(newest.value, self._located, self._stage.image.grid, self.options.reach)
 
     # ---- the link's thread
 
-    def _talk(self) -> None:
+    def _run_link(self) -> None:
         try:
-            asyncio.run(self._converse())
+            asyncio.run(self._serve_link())
         except BaseException as error:  # handed to the thread that waits in __enter__, or logged
             if self._ready.is_set():
                 log.exception("the link ended")
@@ -135,7 +135,7 @@ class Session:
             self._stop.set()
             self._ready.set()
 
-    async def _converse(self) -> None:
+    async def _serve_link(self) -> None:
         self._loop = asyncio.get_running_loop()
         try:
             if self.options.host:

@@ -29,7 +29,7 @@ SUFFIX = {
     "mp4": "cine.mp4", "gif": "cine.gif", "png": "frames", "mha": "cine.mha",
     "igs.mha": "run.igs.mha", "seq.nrrd": "run.seq.nrrd",
 }  # fmt: skip
-WITNESSES = ("echospline", "numpy", "scipy", "numba", "opencv-python-headless", "scikit-fem", "av")
+REPORTED_PACKAGES = ("echospline", "numpy", "scipy", "numba", "opencv-python-headless", "scikit-fem", "av")
 """Packages whose versions are in a report."""
 
 
@@ -195,7 +195,7 @@ def run(
 
 def _versions() -> dict[str, str]:
     found = {}
-    for name in WITNESSES:
+    for name in REPORTED_PACKAGES:
         try:
             found[name] = version(name)
         except PackageNotFoundError:

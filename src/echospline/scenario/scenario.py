@@ -19,8 +19,8 @@ from echospline.atomic import give_name, part_of
 from echospline.errors import InputError
 from echospline.io import read_image
 from echospline.picture import NeedleEcho
-from echospline.scenario.complaints import describe as _describe
-from echospline.scenario.complaints import sentence, shown
+from echospline.scenario.messages import describe as _describe
+from echospline.scenario.messages import sentence, shown
 from echospline.scenario.phantom_section import PhantomSection, ProbeSection
 from echospline.scenario.sections import (
     ExerciseSection,

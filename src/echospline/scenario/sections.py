@@ -89,7 +89,7 @@ class RegionSection(Section):
 
 
 class TissueSection(Section):
-    """What the tissue is made of: used by fem, and by the elastic kernel for Poisson's ratio."""
+    """Material of the tissue: used by fem and green, and by the elastic kernel for Poisson's ratio."""
 
     young: Kilopascals = Field(10.0, gt=0, description="Young's modulus of the background, kPa")
     poisson: float = Field(0.45, ge=0, le=0.5, description="Poisson's ratio of the background")
@@ -101,7 +101,7 @@ class TissueSection(Section):
 
 
 class MeshSection(Section):
-    """The mesh over the image and what holds it."""
+    """The mesh over the image and its clamped edges."""
 
     nodes: tuple[Annotated[int, Field(ge=2, le=4096)], Annotated[int, Field(ge=2, le=4096)]] = Field(
         (40, 30), description="nodes along x and y, corner to corner over the image"
@@ -187,7 +187,7 @@ class ForceSection(Section):
 
 
 class ModelSection(Section):
-    """How the tissue answers."""
+    """The tissue model."""
 
     kind: Literal["tps", "elastic", "green", "fem"] = Field("tps", description="tps, elastic, green or fem")
     landmarks: LandmarkSection = LandmarkSection()
@@ -197,7 +197,7 @@ class ModelSection(Section):
 
 
 class OutputSection(Section):
-    """What is written."""
+    """The files to write."""
 
     fps: float = Field(25.0, gt=0, le=1000, description="frames per second")
     longest_step: Seconds = Field(1 / 30, gt=0, le=10, description="longest time step of the model, s")
@@ -225,7 +225,7 @@ class DiscSection(Section):
 
 
 class ExerciseSection(Section):
-    """What a trainee shall do in the live simulator."""
+    """An exercise of the live simulator."""
 
     name: str = Field(
         min_length=1, max_length=80, description="short and unique; sessions are listed under it"
@@ -241,5 +241,5 @@ class ExerciseSection(Section):
 
     @property
     def landmarks(self) -> list[tuple[float, float]]:
-        """Centres of target and vessels at rest, mm: what is watched while the tissue moves."""
+        """Centres of target and vessels at rest, mm: the points watched while the tissue moves."""
         return [self.target.centre, *(vessel.centre for vessel in self.vessels)]

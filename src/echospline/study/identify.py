@@ -82,7 +82,7 @@ def identify(
     fields : UnitFields
         The model's fields per unit of its linear parameters, and the observation.
     objective : {"mae", "rmse"}
-        What is made least, equation (24).
+        The error to minimise, equation (24).
     seed : int
         Of the starting points of the search and the bootstrap.
     starts : int
@@ -158,7 +158,7 @@ def grid_search(
     observed : ndarray, shape (frames, n, 2)
         mm.
     objective : {"mae", "rmse"}
-        What is made least.
+        The error to minimise.
     """
     began = perf_counter()
     best: tuple[float, dict[str, float], Floats] | None = None

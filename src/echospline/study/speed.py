@@ -172,7 +172,7 @@ def speed(
     Parameters
     ----------
     node_counts : sequence of int
-        About how many nodes.
+        Approximate numbers of nodes.
     seconds : float
         Budget per method and mesh after warm-up; 3 steps at least, 400 at most.
     literal_nodes : int

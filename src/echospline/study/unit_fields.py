@@ -66,7 +66,7 @@ class Observation:
             self.points, self.displacement[order], self.times[order], [self.poses[i] for i in order]
         )
 
-    def remembered_speed(self, alpha3: float) -> Floats:
+    def effective_speed(self, alpha3: float) -> Floats:
         """Return the effective speed of friction: v while the needle moves, then relaxing, equation (16); (frames,)."""
         speed = np.zeros(len(self.poses))
         last, stopped = 0.0, float(self.times[0])
@@ -139,7 +139,7 @@ class SplineFields:
     model : TPSModel
         Grid, clamp, kernel, stiffness and the fixed parameters; its laws must be the printed ones.
     observation : Observation
-        What is to be explained.
+        The observation to fit.
     delta : sequence of float
         Values of delta to try, mm.
     length : (low, high)
@@ -189,7 +189,7 @@ class SplineFields:
         if delta not in self._frames:
             pairs = zip(self.observation.poses, self._tips, strict=True)
             self._frames[delta] = [self._frame(pose, tip, delta) for pose, tip in pairs]
-        speed = self.observation.remembered_speed(values.get("alpha3", 0.0))
+        speed = self.observation.effective_speed(values.get("alpha3", 0.0))
         out = np.zeros((*self.observation.displacement.shape, 3))
         for k, frame in enumerate(self._frames[delta]):
             if frame.factors is not None:
@@ -276,7 +276,7 @@ class ForceFields:
 
     def fields(self, values: Mapping[str, float]) -> Floats:
         """Return the field per unit of tip force and friction, shape (frames, n, 2, 2)."""
-        speed = self.observation.remembered_speed(values.get("alpha3", 0.0))
+        speed = self.observation.effective_speed(values.get("alpha3", 0.0))
         return np.stack([self._tip, self._friction * speed[:, None, None]], axis=-1)
 
     def _unit(self, pose: NeedlePose) -> tuple[Floats, Floats]:

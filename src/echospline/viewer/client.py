@@ -96,7 +96,7 @@ class Client:
 
     async def serve(self, resumed: bool) -> None:
         """Serve until the page closes or breaks the protocol; the engine's thread ends with it."""
-        await self._tell("scene", **self._describe(resumed))
+        await self._send_text("scene", **self._describe(resumed))
         with Pacer(self.seat.engine):
             tasks = [asyncio.create_task(self._receive()), asyncio.create_task(self._send_frames())]
             try:
@@ -172,7 +172,9 @@ class Client:
             case protocol.Compare(name=name) if name is None or name in names:
                 engine.compare(name)
             case protocol.SwitchModel(name=name) | protocol.Compare(name=name):
-                await self._tell("notice", text=f"there is no model {name!r} here; it has {', '.join(names)}")
+                await self._send_text(
+                    "notice", text=f"there is no model {name!r} here; it has {', '.join(names)}"
+                )
             case protocol.StartExercise():
                 await self._start(request)
             case protocol.FinishExercise(keep=keep):
@@ -185,13 +187,13 @@ class Client:
     async def _start(self, request: protocol.StartExercise) -> None:
         exercise = self.seat.scene.exercise(request.exercise)
         if exercise is None:
-            await self._tell("notice", text=f"there is no exercise {request.exercise!r} here")
+            await self._send_text("notice", text=f"there is no exercise {request.exercise!r} here")
             return
         self._begin(
             Training(exercise, Recorder(self.seat.engine.period, exercise.time_limit), request.trainee)
         )
         self.seat.engine.reset()
-        await self._tell("running", exercise=exercise.name, replay=False)
+        await self._send_text("running", exercise=exercise.name, replay=False)
 
     def _begin(self, training: Training) -> None:
         self.seat.end_training()
@@ -202,15 +204,15 @@ class Client:
     async def _finish(self, keep: bool) -> None:
         training, newest = self.seat.training, self.seat.engine.snapshots.latest()
         if training is None or newest is None:
-            await self._tell("notice", text="no exercise is running")
+            await self._send_text("notice", text="no exercise is running")
             return
         trace, model = training.recorder.trace(), newest.value.model
         self.seat.end_training()
         if not keep:
-            await self._tell("stopped")
+            await self._send_text("stopped")
             return
         summary = await asyncio.to_thread(self._summary, training, trace, model)
-        await self._tell("summary", **summary)
+        await self._send_text("summary", **summary)
 
     def _summary(self, training: Training, trace: Trace, model: str) -> dict[str, Any]:
         result = score(trace, training.exercise)
@@ -243,14 +245,14 @@ class Client:
                     "this session was recorded in another image: its targets lie outside this one"
                 )
         except EchosplineError as error:
-            await self._tell("notice", text=str(error))
+            await self._send_text("notice", text=str(error))
             return
         recorder = Recorder(self.seat.engine.period, self.seat.engine.period * len(poses))
         self._begin(Training(exercise, recorder, session.trainee, number))
         if session.model in [name for name, _ in self.seat.scene.names]:
             self.seat.engine.switch(session.model)
         self.seat.engine.replay(poses)
-        await self._tell("running", exercise=exercise.model_dump(), replay=True, model=session.model)
+        await self._send_text("running", exercise=exercise.model_dump(), replay=True, model=session.model)
 
     # --- to the page
 
@@ -268,7 +270,7 @@ class Client:
             if snapshot.failure != self._failure:
                 self._failure = snapshot.failure
                 if snapshot.failure is not None:
-                    await self._tell("failure", text=snapshot.failure)
+                    await self._send_text("failure", text=snapshot.failure)
             self._sent += 1
             if self._sent - self._drawn >= IN_FLIGHT:
                 self._credit.clear()
@@ -301,7 +303,7 @@ class Client:
         assert newest is not None  # the callback has announced it
         return newest
 
-    async def _tell(self, what: str, **content: object) -> None:
+    async def _send_text(self, what: str, **content: object) -> None:
         async with self._sending:
             await self.socket.send_text(json.dumps({"tell": what, **content}, allow_nan=False))
 
