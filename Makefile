@@ -5,6 +5,9 @@ BIN    := $(VENV)/bin
 CORE   := core/build.py $(wildcard core/include/echospline/* core/src/*)
 NATIVE := $(wildcard core/include/echospline/* core/src/* core/tests/*.c core/tests/*.cpp core/hosts/*/*.c)
 
+# Warnings of the core's compiler are errors here, not on a user's machine.
+export ECHOSPLINE_STRICT := 1
+
 .PHONY: setup demo live test check core-check core-sanitize core-fuzz wasm wheels format clean
 
 setup: $(VENV)/.ready build/core/.library
@@ -45,7 +48,7 @@ check: setup core-check
 	@if [ -x node_modules/.bin/tsc ]; then echo node_modules/.bin/tsc; node_modules/.bin/tsc; \
 	  else echo "typescript is not installed (npm): the types of the page's JavaScript are not checked"; fi
 
-core-check: setup # warnings are errors here, not on a user's machine
+core-check: setup
 	$(BIN)/clang-format --dry-run --Werror $(NATIVE)
 	$(BIN)/python core/build.py strict
 

@@ -206,6 +206,7 @@ def test_no_level_leaves_a_symbol_that_another_might_take():
 @pytest.mark.skipif(not WASM.exists(), reason="echospline.wasm is not built; run make wasm")
 def test_webassembly_is_small_and_needs_nothing():
     build.check_wasm(WASM)
+    assert WASM.stat().st_size < 200_000
     names = set(re.findall(rb"echospline_\w+", WASM.read_bytes()))
     assert {name.encode() for name in declared()} <= names
 
