@@ -128,10 +128,8 @@ class Session {
       o.clamped_points = given() ? points : nullptr;
       o.clamped_point_count = choices_.below(3);
     }
-    const int64_t nodes =
-        o.shape[0] > 0 && o.shape[0] < 20 && o.shape[1] > 0 && o.shape[1] < 20 && o.shape[2] > 0 && o.shape[2] < 20
-            ? int64_t(o.shape[0]) * o.shape[1] * (o.dimension == 3 ? o.shape[2] : 1)
-            : 0;
+    int64_t nodes = 1;  // 0: a shape that has to be refused, or one too large to give every node a stiffness
+    for (int k = 0; k < (o.dimension == 3 ? 3 : 2); ++k) nodes *= o.shape[k] > 1 && o.shape[k] < 100 ? o.shape[k] : 0;
     if (nodes && choices_.below(4) == 0) {
       stiffness = static_cast<double*>(std::malloc(nodes * sizeof(double)));
       for (int64_t i = 0; i < nodes; ++i) stiffness[i] = 0.5 + i % 3;
@@ -147,7 +145,7 @@ class Session {
     if (status == ECHOSPLINE_OK) {
       require(scene_ && where, "a scene was made of nothing");
       dimension_ = o.dimension, nodes_ = echospline_scene_node_count(scene_);
-      require(nodes_ == nodes, "the scene's nodes are not its shape's");
+      require(nodes_ == nodes || nodes == 0, "the scene's nodes are not its shape's");
       for (int k = 0; k < 3; ++k) origin_[k] = o.origin[k], extent_[k] = o.spacing[k] * (o.shape[k] - 1);
     }
     const echospline_status made = echospline_tissue_create(given() ? scene_ : nullptr, given() ? &tissue_ : nullptr);
