@@ -18,13 +18,10 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 
-from echospline.acoustic import channel_data
-from echospline.beamform import LinearArray, delay_and_sum, demodulate
-from echospline.echo import Display, Echo
-from echospline.grid import RegularGrid
-from echospline.phantom import Phantom
-from echospline.probe import LINEAR
-from echospline.speckle import speckle_statistics
+from echospline.laboratory import LinearArray, Phantom, channel_data, delay_and_sum, speckle_statistics
+from echospline.laboratory.beamform import demodulate
+from echospline.scene import Display, Echo, RegularGrid
+from echospline.scene.transducer import LINEAR
 from echospline.tracking import FlowTracker
 
 mpl.use("agg")

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from echospline.echo import Echo
-from echospline.probe import Probe
+from echospline.scene import Echo, Transducer
 
 
-def walker_trahey(probe: Probe, window: float, rho: float = 1.0, snr: float | None = None) -> float:
+def walker_trahey(probe: Transducer, window: float, rho: float = 1.0, snr: float | None = None) -> float:
     """Axial bound of one RF line in um (Walker and Trahey 1995): window in mm, rho the correlation of the pair."""
     f0, c = probe.frequency * 1e6, probe.sound_speed * 1e3  # Hz, m/s
     ratio = 10.0 ** ((probe.snr if snr is None else snr) / 20.0)

@@ -16,9 +16,8 @@ import time
 from importlib.resources import as_file, files
 from pathlib import Path
 
-from echospline.dataset import create_store, make_sample
 from echospline.scenario import load
-from echospline.sweep import Task, sweep
+from echospline.study import Task, create_store, make_sample, sweep
 
 
 def main() -> None:
@@ -31,7 +30,7 @@ def main() -> None:
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     results = {}
-    with as_file(files("echospline.data").joinpath("dataset.toml")) as base:
+    with as_file(files("echospline").joinpath("data", "dataset.toml")) as base:
         one = args.out / "one.zarr"
         create_store(one, load(base), args.n, 8, 0, ["dataset.toml"])
         peak = []

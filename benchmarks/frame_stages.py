@@ -12,10 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from echospline.image import UltrasoundImage
-from echospline.models import build_model
-from echospline.run import run
-from echospline.scenario import Scenario
+from echospline.scenario import Scenario, build_model
+from echospline.scenario.run import run
+from echospline.scene import UltrasoundImage
 
 
 def measure(nodes: tuple[int, int], kind: str) -> dict[str, float]:

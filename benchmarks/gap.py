@@ -10,14 +10,11 @@ solved for by least distances; everything else stands in the line.
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from echospline.accuracy import CLAMPED, FITTED, HELD_OUT, Case, observe, oracle
-from echospline.identify import _least
-from echospline.mechanics.anchored_kernel import AnchoredKernel
-from echospline.mechanics.fem import FEMModel
+from echospline.mechanics import AnchoredKernel, Clamps, Elastic, FEMModel, ThinPlate
 from echospline.mechanics.half_plane import GreensFunction
-from echospline.mechanics.kernels import Elastic, ThinPlate
-from echospline.mechanics.landmarks import Clamps
-from echospline.metrics import distance, field_error
+from echospline.scene import distance, field_error
+from echospline.study.accuracy import CLAMPED, FITTED, HELD_OUT, Case, observe, oracle
+from echospline.study.identify import _least
 
 CASE = Case(steps=20)
 GRID = CASE.grid

@@ -14,17 +14,13 @@ from pathlib import Path
 
 import numpy as np
 
-from echospline.deformation import Deformation
-from echospline.echo import Display
-from echospline.grid import RegularGrid
-from echospline.image import UltrasoundImage
-from echospline.kelvinlet import NeedleField
-from echospline.needle import NeedlePose
-from echospline.phantom import Phantom
-from echospline.probe import LINEAR
-from echospline.speckle import correlation_coefficient, speckle_statistics
-from echospline.tracking import FlowTracker, _pull, correlation
-from echospline.warp import warp
+from echospline.laboratory import NeedleField, Phantom, speckle_statistics
+from echospline.laboratory.speckle import correlation_coefficient
+from echospline.picture import Deformation, warp
+from echospline.scene import Display, NeedlePose, RegularGrid, UltrasoundImage
+from echospline.scene.transducer import LINEAR
+from echospline.tracking import FlowTracker
+from echospline.tracking.tracker import _pull, correlation
 
 GRID = RegularGrid((400, 400), (0.1, 0.1))
 

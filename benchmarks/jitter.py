@@ -19,8 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
-from echospline.bench import MESHES, scene
-from echospline.needle import NeedlePose
+from echospline.scene import NeedlePose
+from echospline.study.bench import MESHES, scene
 
 PERIOD = 1e-3
 

@@ -25,18 +25,15 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from echospline.cli.link import make_stage
+from echospline.openigtlink import Link, Looks, Message, Rates, Session, SessionOptions, Transform
 from echospline.openigtlink.crc64 import crc64, warm_up
 from echospline.openigtlink.decoder import Decoder
 from echospline.openigtlink.image import Image
-from echospline.openigtlink.link import Link
-from echospline.openigtlink.message import Message, encode
+from echospline.openigtlink.message import encode
+from echospline.openigtlink.outgoing import draw
 from echospline.openigtlink.peer import Peer
-from echospline.openigtlink.picture import Looks, draw
-from echospline.openigtlink.pose import Transform
-from echospline.openigtlink.scene import Visible
-from echospline.openigtlink.session import Session
-from echospline.openigtlink.stage import Rates, SessionOptions
 from echospline.scenario import Scenario
+from echospline.scene import Visible
 
 SIDE, WARM_UP = 512, 0.5
 PICTURE = np.random.default_rng(1).integers(0, 256, (1, SIDE, SIDE), dtype=np.uint8)

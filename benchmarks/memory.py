@@ -9,8 +9,8 @@ import argparse
 
 import numpy as np
 
-from echospline.bench import MESHES, scene
-from echospline.needle import NeedlePose
+from echospline.scene import NeedlePose
+from echospline.study.bench import MESHES, scene
 
 
 def resident():

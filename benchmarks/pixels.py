@@ -10,13 +10,10 @@ from time import perf_counter, process_time
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from echospline.bench import MESHES, path, scene
-from echospline.deformation import Deformation
-from echospline.grid import RegularGrid
-from echospline.image import UltrasoundImage
-from echospline.mechanics.kernels import Elastic, ThinPlate
-from echospline.mechanics.tps import TPSModel
-from echospline.warp import warp
+from echospline.mechanics import Elastic, ThinPlate, TPSModel
+from echospline.picture import Deformation, warp
+from echospline.scene import RegularGrid, UltrasoundImage
+from echospline.study.bench import MESHES, path, scene
 
 
 def show(name, rows):

@@ -14,9 +14,9 @@ from time import perf_counter
 
 import numpy as np
 
-from echospline.bench import MESHES, path, scene
 from echospline.mechanics import compiled_step, mesh_field, tip_column, touch
 from echospline.mechanics.tip_patch import NODES
+from echospline.study.bench import MESHES, path, scene
 
 
 def timed(name, call, repeats=2000):

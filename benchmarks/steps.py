@@ -22,11 +22,10 @@ os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL
 import numpy as np
 from matplotlib.figure import Figure
 
-from echospline.bench import bare_product, path, time_steps
-from echospline.grid import RegularGrid
+from echospline.mechanics import Elastic, ThinPlate, TPSModel, TPSParameters
 from echospline.mechanics.finite_elements import factor, stiffness
-from echospline.mechanics.kernels import Elastic, ThinPlate
-from echospline.mechanics.tps import TPSModel, TPSParameters
+from echospline.scene import RegularGrid
+from echospline.study.bench import bare_product, path, time_steps
 
 MESHES = [(26, 20), (40, 30), (78, 58), (140, 104)]
 DEPTHS = [(78, 58, depth) for depth in (4, 8, 16, 26)]

@@ -24,18 +24,12 @@ import numpy as np
 from scipy.io import loadmat
 
 import bounds
-from echospline.beamform import LinearArray, delay_and_sum, demodulate, rigid_motion
-from echospline.block_matching import BlockMatching
-from echospline.carrier_phase import CarrierPhase
-from echospline.dense_flow import DenseFlow
-from echospline.echo import Display, Echo
-from echospline.grid import RegularGrid
-from echospline.image import UltrasoundImage
-from echospline.kelvinlet import NeedleField
-from echospline.needle import NeedlePose
-from echospline.phantom import Phantom
-from echospline.probe import LINEAR, PROBES
-from echospline.tracking import FlowTracker, regrid, track
+from echospline.laboratory import LinearArray, NeedleField, Phantom, delay_and_sum
+from echospline.laboratory.beamform import demodulate, rigid_motion
+from echospline.scene import TRANSDUCERS, Display, Echo, NeedlePose, RegularGrid, UltrasoundImage
+from echospline.scene.transducer import LINEAR
+from echospline.tracking import BlockMatching, CarrierPhase, DenseFlow, FlowTracker, track
+from echospline.tracking.tracker import regrid
 
 mpl.use("agg")
 import matplotlib.pyplot as plt
@@ -62,7 +56,7 @@ def laboratory(name: str, peak: float, seed: int, pixels: int = 400, **probe: fl
     field = NeedleField(grid, pose, peak)
     inner = RegularGrid((33, 33), ((x1 - x0 - 8) / 32, (y1 - y0 - 8) / 32), (x0 + 4, y0 + 4)).nodes
     region = tip + 4.0 * np.asarray(pose.axis) + RegularGrid((10, 20), (2 / 9, 3 / 19), (-1.0, -1.5)).nodes
-    phantom = Phantom(replace(PROBES[name], **probe), grid, seed)
+    phantom = Phantom(replace(TRANSDUCERS[name], **probe), grid, seed)
     return phantom, field, inner, region
 
 
@@ -102,7 +96,7 @@ def average(tracker, kind, name, peak, seeds, replaced=0.0, pixels=400, **probe)
 
 def bound(name, replaced=0.0, **probe):
     """Two-dimensional bounds of B-mode and of echoes, and Walker and Trahey's for one line of 3 mm."""
-    phantom = Phantom(replace(PROBES[name], **probe), RegularGrid((400, 400), (PIXEL[name],) * 2), 99)
+    phantom = Phantom(replace(TRANSDUCERS[name], **probe), RegularGrid((400, 400), (PIXEL[name],) * 2), 99)
     a, b = phantom.form(noise_seed=1), phantom.form(noise_seed=2, replaced=replaced)
     pictures = [x.b_mode(grid=phantom.grid).pixels.astype(float) for x in (a, b)]
     return {

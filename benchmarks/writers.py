@@ -10,8 +10,7 @@ import numpy as np
 from PIL import Image
 from scipy.ndimage import map_coordinates
 
-from echospline.data import sample_image
-from echospline.io import open_cine, open_writer
+from echospline.io import open_cine, open_writer, sample_image
 
 FRAMES, FPS = 60, 30
 

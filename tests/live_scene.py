@@ -8,12 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from echospline.grid import RegularGrid
-from echospline.image import UltrasoundImage
-from echospline.viewer.exercise import Disc, Exercise
-from echospline.viewer.scene import Scene
-from echospline.viewer.server import Settings, build_app, serve
-from echospline.viewer.sessions import Sessions
+from echospline.scene import RegularGrid, UltrasoundImage
+from echospline.viewer import Disc, Exercise, Scene, Sessions, Settings, build_app, serve
 
 IMAGE_GRID = RegularGrid((161, 121), (0.25, 0.25))
 MESH = RegularGrid.covering(IMAGE_GRID, (41, 31))

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from echospline.needle import NeedlePose
+from echospline.scene import NeedlePose
 
 
 def wandering(seed: int, dt: float, duration: float, width: float = 40.0) -> Iterator[NeedlePose]:

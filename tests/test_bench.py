@@ -7,9 +7,9 @@ import json
 import numpy as np
 from typer.testing import CliRunner
 
-from echospline import bench
-from echospline.bench import MESHES, Row, bare_product, path, scene, time_steps
 from echospline.cli.app import app
+from echospline.study import bench
+from echospline.study.bench import MESHES, Row, bare_product, path, scene, time_steps
 
 KEYS = ["name", "nodes", "landmarks", "median_ms", "p99_ms", "limit_ms", "ratio_to_limit"]
 
@@ -26,7 +26,7 @@ def test_json_rows_have_the_keys_promised(monkeypatch):
 
 def test_the_table_says_what_fits(monkeypatch):
     rows = [Row("step", 1200, 51, 0.02, 0.05, 0.004, 5.0), Row("frame", 4524, 51, 20.0, 30.0, 0.01, 2000.0)]
-    monkeypatch.setattr("echospline.cli.bench.run", lambda _: rows)
+    monkeypatch.setattr("echospline.cli.bench.benchmark", lambda _: rows)
     lines = CliRunner().invoke(app, ["bench"]).stdout.splitlines()
     step = next(line.split() for line in lines if line.startswith("step "))
     frame = next(line.split() for line in lines if line.startswith("frame "))

@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from echospline.calibrate import calibrate
 from echospline.cli.app import app
 from echospline.errors import InputError
 from echospline.io import read_displacement
-from echospline.io.tracks import write_track
 from echospline.scenario import load
-from echospline.tracking import Track
+from echospline.study import calibrate
+from echospline.tracking import Track, write_track
 
 SCENE = """
 [image]

@@ -11,12 +11,12 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from echospline.cli.app import app, main
+from echospline.cli import main
+from echospline.cli.app import app
 from echospline.cli.info import describe
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
 from echospline.io import DisplacementWriter, read
-from echospline.needle import NeedlePose
+from echospline.scene import NeedlePose, RegularGrid
 
 
 def shown(*words: str) -> str:

@@ -30,9 +30,9 @@ def test_code_compiled_before_the_last_change_is_dropped(tmp_path):
 LOOP = """
 import importlib
 from numba.core.dispatcher import Dispatcher
-from echospline.grid import RegularGrid
-from echospline.mechanics.tps import TPSModel
-from echospline.needle import NeedlePose
+from echospline.scene import RegularGrid
+from echospline.mechanics import TPSModel
+from echospline.scene import NeedlePose
 from paths import wandering
 
 names = ("basis", "compiled", "compiled_step", "contacts", "mesh_field", "tip_column", "touch")

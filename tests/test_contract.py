@@ -7,18 +7,19 @@ import numpy as np
 import pytest
 
 import echospline
-from echospline.deformation import Deformation
-from echospline.grid import RegularGrid
-from echospline.mechanics.fem import FEMModel
-from echospline.mechanics.forces import NeedleForces
-from echospline.mechanics.green import GreenModel
-from echospline.mechanics.kernels import Elastic, ThinPlate
-from echospline.mechanics.tps import TPSModel, TPSParameters
-from echospline.models import MODELS as NAMES
-from echospline.models import build_model
-from echospline.needle import Insertion, NeedlePose
-from echospline.scenario import load
-from echospline.tissue import Tissue
+from echospline.mechanics import (
+    Elastic,
+    FEMModel,
+    GreenModel,
+    NeedleForces,
+    ThinPlate,
+    TPSModel,
+    TPSParameters,
+)
+from echospline.picture import Deformation
+from echospline.scenario import MODELS as NAMES
+from echospline.scenario import build_model, load
+from echospline.scene import Insertion, NeedlePose, RegularGrid, Tissue
 
 GRID = RegularGrid((21, 16), (2.0, 2.0))
 BOX = ("left", "right", "bottom")

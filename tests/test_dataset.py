@@ -7,12 +7,12 @@ import pytest
 from typer.testing import CliRunner
 
 from echospline.cli.app import app
-from echospline.dataset import Variation, drawn, make_sample, needle_mask
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
 from echospline.io import read, read_displacement
-from echospline.needle import NeedlePose
 from echospline.scenario import load
+from echospline.scene import NeedlePose, RegularGrid
+from echospline.study import make_sample
+from echospline.study.dataset import Variation, drawn, needle_mask
 
 zarr = pytest.importorskip("zarr")
 
@@ -167,7 +167,7 @@ def test_missing_zarr_names_the_command(monkeypatch, base, tmp_path):
     def absent(name):
         raise ImportError(name)
 
-    monkeypatch.setattr("echospline.dataset.import_module", absent)
+    monkeypatch.setattr("echospline.study.dataset.import_module", absent)
     with pytest.raises(ImportError, match="echospline\\[dataset\\]"):
         make_sample(store=str(tmp_path), bases=[str(base)], index=0, seed=0, frames=3)
 

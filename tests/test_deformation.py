@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import RegularGridInterpolator
 
-from echospline.deformation import Deformation
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
+from echospline.picture import Deformation
+from echospline.scene import RegularGrid
 
 MESH = RegularGrid((21, 17), (2.0, 2.0))  # 40 x 32 mm
 PIXELS = RegularGrid((201, 161), (0.2, 0.2))

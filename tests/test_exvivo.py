@@ -12,17 +12,11 @@ from typer.testing import CliRunner
 
 from echospline.cli.app import app
 from echospline.cli.track import load
-from echospline.echo import Echo
 from echospline.errors import InputError
-from echospline.exvivo import paired
-from echospline.grid import RegularGrid
-from echospline.io import open_writer, read, read_displacement
-from echospline.io.echoes import EchoWriter, read_echoes
-from echospline.io.needle_path import read_needle
-from echospline.io.tracks import read_track, write_track
-from echospline.needle import NeedlePose
-from echospline.region import grid_over, inside_ahead, region_ahead
-from echospline.tracking import Track
+from echospline.io import EchoWriter, open_writer, read, read_displacement, read_echoes, read_needle
+from echospline.scene import Echo, NeedlePose, RegularGrid
+from echospline.study.exvivo import paired
+from echospline.tracking import Track, grid_over, inside_ahead, read_track, region_ahead, write_track
 
 SCENARIO = """
 [model]

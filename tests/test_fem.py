@@ -6,12 +6,9 @@ import numpy as np
 import pytest
 
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
-from echospline.mechanics.fem import FEMModel
+from echospline.mechanics import FEMModel, NeedleForces
 from echospline.mechanics.finite_elements import factor, point_loads, stiffness
-from echospline.mechanics.forces import NeedleForces
-from echospline.needle import Insertion, NeedlePose
-from echospline.tissue import Circle, Region, Tissue
+from echospline.scene import Circle, Insertion, NeedlePose, Region, RegularGrid, Tissue
 
 GRID = RegularGrid((31, 25), (40 / 30, 30 / 24))
 PRINTED = NeedleForces(ramp=0.0)

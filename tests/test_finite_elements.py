@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
 from echospline.mechanics.finite_elements import (
     element_centres,
     factor,
@@ -15,6 +14,7 @@ from echospline.mechanics.finite_elements import (
     shape_functions,
     stiffness,
 )
+from echospline.scene import RegularGrid
 
 E, NU, THICKNESS = 10.0, 0.45, 5.0  # kPa, 1, mm
 GRID = RegularGrid((13, 9), (1.5, 2.0), (-9.0, 0.0))

@@ -4,13 +4,9 @@ import numpy as np
 import pytest
 
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
-from echospline.mechanics.fem import FEMModel
-from echospline.mechanics.forces import NeedleForces
-from echospline.mechanics.green import GreenModel
+from echospline.mechanics import FEMModel, GreenModel, NeedleForces
 from echospline.mechanics.half_plane import GreensFunction, fundamental
-from echospline.needle import Insertion, NeedlePose
-from echospline.tissue import Circle, Region, Tissue
+from echospline.scene import Circle, Insertion, NeedlePose, Region, RegularGrid, Tissue
 
 GRID = RegularGrid((40, 30), (40 / 39, 30 / 29))
 NU = 0.31

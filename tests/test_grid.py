@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
-from echospline.image import Cine, UltrasoundImage
+from echospline.scene import Cine, RegularGrid, UltrasoundImage
 
 GRID = RegularGrid((5, 4), (0.5, 2.0), (10.0, -1.0))
 

@@ -5,17 +5,18 @@ import pytest
 from scipy.optimize import minimize
 
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
-from echospline.identify import grid_search, identify
-from echospline.mechanics.fem import FEMModel
-from echospline.mechanics.forces import NeedleForces
-from echospline.mechanics.green import GreenModel
-from echospline.mechanics.kernels import Elastic, ThinPlate
-from echospline.mechanics.tps import TPSModel, TPSParameters
-from echospline.metrics import distance, field_error
-from echospline.needle import Insertion
-from echospline.tissue import Tissue
-from echospline.unit_fields import ForceFields, Observation, SplineFields
+from echospline.mechanics import (
+    Elastic,
+    FEMModel,
+    GreenModel,
+    NeedleForces,
+    ThinPlate,
+    TPSModel,
+    TPSParameters,
+)
+from echospline.scene import Insertion, RegularGrid, Tissue, distance, field_error
+from echospline.study import ForceFields, Observation, SplineFields, identify
+from echospline.study.identify import grid_search
 
 GRID = RegularGrid((25, 19), (40 / 24, 30 / 18))
 PRINTED = {"loading": "immediate", "drag": 0.0, "tip": "point", "contact_spacing": 0.0, "anchor_spacing": 3.0}

@@ -15,8 +15,8 @@ from pydicom.encaps import encapsulate, generate_frames
 from pydicom.uid import ExplicitVRLittleEndian, UltrasoundMultiFrameImageStorage
 
 from echospline.errors import InputError, MissingExtraError
-from echospline.image import Cine, UltrasoundImage
 from echospline.io import open_recording, read
+from echospline.scene import Cine, UltrasoundImage
 
 SONOQUE = "itkpocus/sonoque_anechoic-3mm-3mm.dcm"
 CARDIAC = "pydicom/examples_ybr_color.dcm"
@@ -171,7 +171,7 @@ LOSSLESS = ["SC_rgb_jpeg_gdcm.dcm", "MR_small_jpeg_ls_lossless.dcm"]
 
 @pytest.mark.parametrize("name", LOSSLESS)
 def test_a_compression_that_needs_the_extra_says_which(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("echospline.io.dicom.find_spec", lambda name: None)
+    monkeypatch.setattr("echospline.io.dicom.pixels.find_spec", lambda name: None)
     with pytest.raises(MissingExtraError, match=r"pip install 'echospline\[dicom\]'"):
         read(get_testdata_file(name), spacing=(0.1, 0.1))
 

@@ -21,10 +21,8 @@ from PIL import Image
 from pydicom.data import get_testdata_file
 
 from echospline.errors import EchosplineError, InputError
-from echospline.grid import RegularGrid
-from echospline.io import DisplacementWriter, open_writer, read, read_displacement
-from echospline.io.displacement import displacement_shapes
-from echospline.needle import NeedlePose
+from echospline.io import DisplacementWriter, displacement_shapes, open_writer, read, read_displacement
+from echospline.scene import NeedlePose, RegularGrid
 
 STACK = np.random.default_rng(7).integers(0, 256, (3, 12, 17), dtype=np.uint8)
 
@@ -254,7 +252,7 @@ BOUNDED = """
 import resource, sys
 from echospline.errors import InputError
 from echospline.io import read, read_displacement
-import echospline.io.picture, echospline.io.dicom, echospline.io.volume, echospline.io.video
+import echospline.io.still, echospline.io.dicom, echospline.io.volume, echospline.io.video
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 for name in sys.argv[1:]:
     try:

@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from echospline.data import sample_image
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
-from echospline.image import Cine, UltrasoundImage
-from echospline.io import open_cine, open_writer, read
+from echospline.io import open_cine, open_writer, read, sample_image
+from echospline.scene import Cine, RegularGrid, UltrasoundImage
 
 
 def test_shipped_image_is_the_crop_its_note_describes(recordings: Path) -> None:

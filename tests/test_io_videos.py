@@ -14,9 +14,8 @@ import pytest
 from PIL import Image
 
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
-from echospline.image import Cine
 from echospline.io import open_cine, open_recording, open_writer, read
+from echospline.scene import Cine, RegularGrid
 
 GRID = RegularGrid((48, 32), (0.1, 0.1))
 

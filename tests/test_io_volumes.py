@@ -10,9 +10,8 @@ import pytest
 import SimpleITK
 
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
-from echospline.image import Cine, UltrasoundImage
 from echospline.io import open_cine, open_writer, read
+from echospline.scene import Cine, RegularGrid, UltrasoundImage
 
 STACK = np.random.default_rng(5).integers(0, 256, (4, 21, 33), dtype=np.uint8)
 SUFFIXES = ["mha", "mhd", "nrrd", "nhdr", "nii", "nii.gz"]

@@ -17,9 +17,8 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
 from echospline.io import DisplacementWriter, open_writer, read, read_displacement
-from echospline.needle import NeedlePose
+from echospline.scene import NeedlePose, RegularGrid
 
 GRID = RegularGrid((33, 21), (0.1, 0.2), (1.5, -2.0))
 
@@ -229,9 +228,9 @@ def test_displacement_record_comes_back_whole(tmp_path: Path) -> None:
 
 KILLED = """
 import sys, numpy as np
-from echospline.grid import RegularGrid
+from echospline.scene import RegularGrid
 from echospline.io import open_writer, DisplacementWriter
-from echospline.needle import NeedlePose
+from echospline.scene import NeedlePose
 name = sys.argv[1]
 rng = np.random.default_rng(0)
 if name.endswith(".npz"):
@@ -310,9 +309,9 @@ def test_a_comment_that_is_no_spacing_is_left_alone(tmp_path: Path, lengths: str
 
 BOUNDED = """
 import resource, sys, numpy as np
-from echospline.grid import RegularGrid
+from echospline.scene import RegularGrid
 from echospline.io import DisplacementWriter, open_writer
-from echospline.needle import NeedlePose
+from echospline.scene import NeedlePose
 name, few, many = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
 grid = RegularGrid((300, 200), (0.1, 0.1))
 rng = np.random.default_rng(0)

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
 from echospline.live import Command, LiveEngine, Metronome, Pacer, Slot, follow
-from echospline.needle import Insertion, NeedlePose
+from echospline.scene import Insertion, NeedlePose, RegularGrid
 
 GRID = RegularGrid((9, 7), (5.0, 5.0))
 HOME = NeedlePose((20.0, 0.0), (20.0, 0.0))

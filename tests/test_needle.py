@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from echospline.errors import InputError
-from echospline.needle import Insertion, NeedlePose
+from echospline.scene import Insertion, NeedlePose
 
 coordinate = st.floats(-50, 50)
 point = st.tuples(coordinate, coordinate)

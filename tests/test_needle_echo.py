@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from echospline.errors import InputError
-from echospline.image import UltrasoundImage
-from echospline.needle import NeedlePose
-from echospline.needle_echo import NeedleEcho, draw_needle, needle_echo
+from echospline.picture import NeedleEcho, draw_needle
+from echospline.picture.needle_echo import needle_echo
+from echospline.scene import NeedlePose, UltrasoundImage
 
 BARE = NeedleEcho(shaft=False, tip=False, reverberation=False, shadow=False)
 GREY = UltrasoundImage.from_array(np.full((400, 500), 100, np.uint8), (0.1, 0.1))

@@ -13,15 +13,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from echospline.errors import InputError, ProtocolError
+from echospline.openigtlink import Message, Position, Status, String, Transform
 from echospline.openigtlink.crc64 import POLYNOMIAL, crc64
 from echospline.openigtlink.decoder import BOUND, BOUNDS, Decoder
-from echospline.openigtlink.geometry import Point, Points, PolyData
 from echospline.openigtlink.header import HEADER_SIZE, Header
 from echospline.openigtlink.image import Image
-from echospline.openigtlink.message import Content, Message, Request, Unread, encode
+from echospline.openigtlink.message import Content, Request, Unread, encode
 from echospline.openigtlink.ndarray import NDArrayMessage
-from echospline.openigtlink.pose import Position, Transform
-from echospline.openigtlink.text import Capability, Command, CommandReply, Status, String
+from echospline.openigtlink.polydata import Point, Points, PolyData
+from echospline.openigtlink.text import Capability, CommandMessage, CommandReply
 
 GOLDEN = {
     p.stem: p.read_bytes() for p in sorted((Path(__file__).parent / "openigtlink" / "golden").glob("*.bin"))
@@ -201,7 +201,7 @@ CONTENTS: list[Content] = [
     Image(np.arange(24, dtype=np.uint8).reshape(1, 2, 4, 3), np.eye(4)),
     Status(1, 0, "", "working"),
     String("naïve µm"),
-    Command(7, "Start", "<Command Name='Start'/>"),
+    CommandMessage(7, "Start", "<Command Name='Start'/>"),
     CommandReply(7, "", "done"),
     Points((Point("Target", (1, 2, 3)),)),
     PolyData(np.eye(3), polygons=((0, 1, 2),)),
@@ -253,7 +253,7 @@ def test_metadata_and_message_id_are_those_that_pyigtl_packs_and_reads() -> None
 @pytest.mark.parametrize("width", [128, 32, 20])
 def test_commands_are_read_in_the_three_layouts_that_peers_send(width: int) -> None:
     body = struct.pack(f">I{width}sHI", 5, b"StartRecording", 3, 4) + b"<a/>"
-    assert one(sealed("COMMAND", body, 1)).content == Command(5, "StartRecording", "<a/>")
+    assert one(sealed("COMMAND", body, 1)).content == CommandMessage(5, "StartRecording", "<a/>")
     assert one(sealed("RTS_COMMAND", body, 1)).content == CommandReply(5, "StartRecording", "<a/>")
 
 

@@ -13,14 +13,13 @@ import numpy as np
 import pytest
 
 from echospline.errors import InputError
+from echospline.openigtlink import Link, LinkLimits, Message, Status, String, Transform
 from echospline.openigtlink.decoder import Decoder
 from echospline.openigtlink.header import Header
 from echospline.openigtlink.image import Image
-from echospline.openigtlink.link import Link, LinkLimits
-from echospline.openigtlink.message import Message, Request, encode
+from echospline.openigtlink.message import Request, encode
 from echospline.openigtlink.peer import Patience, Peer
-from echospline.openigtlink.pose import Transform
-from echospline.openigtlink.text import NOT_FOUND, Capability, Status, String
+from echospline.openigtlink.text import NOT_FOUND, Capability
 
 GOLDEN = {
     p.stem: p.read_bytes() for p in sorted((Path(__file__).parent / "openigtlink" / "golden").glob("*.bin"))
@@ -219,7 +218,7 @@ def test_a_hostile_stream_is_closed_with_a_logged_reason_and_the_others_lose_not
             bad.send(GOLDEN["String"], bytes_sent)
             assert await bad.ends()
             await until(lambda: len(link.peers) == 1)
-            assert reason in link.farewells[-1][1]
+            assert reason in link.departures[-1][1]
             assert reason in caplog.text
             assert [m.device for m in inbox.messages] == ["String"]  # what came before the fault counts
             link.publish(picture(3))
@@ -249,8 +248,8 @@ def test_a_stream_that_ends_inside_a_message_says_so() -> None:
             peer.send(GOLDEN["Status"], GOLDEN["Point"][:200])
             await peer.writer.drain()
             peer.writer.close()
-            await until(lambda: bool(link.farewells))
-            assert "in the middle of POINT: 142 of 272 bytes" in link.farewells[0][1]
+            await until(lambda: bool(link.departures))
+            assert "in the middle of POINT: 142 of 272 bytes" in link.departures[0][1]
             assert [m.device for m in inbox.messages] == ["Status"]
 
     run(scene)
@@ -262,7 +261,7 @@ def test_a_peer_silent_inside_a_message_is_closed_as_truncated() -> None:
             idle, stuck = await client(port), await client(port)
             stuck.send(GOLDEN["Point"][:100])
             assert await stuck.ends()
-            assert "truncated" in link.farewells[0][1]
+            assert "truncated" in link.departures[0][1]
             assert len(link.peers) == 1  # silence between messages is no fault: Slicer sends on change only
             idle.writer.close()
 
@@ -277,8 +276,8 @@ def test_a_peer_that_takes_nothing_for_too_long_is_closed_as_stalled() -> None:
             for level in range(60):
                 link.publish(picture(level % 250, 1024))
                 await asyncio.sleep(0.005)
-            await until(lambda: bool(link.farewells))
-            assert "stalled" in link.farewells[0][1]
+            await until(lambda: bool(link.departures))
+            assert "stalled" in link.departures[0][1]
             dead.writer.close()
 
     run(scene)
@@ -411,8 +410,8 @@ def test_a_peer_that_asks_without_reading_is_closed() -> None:
             rude = await client(port, 4096)
             await until(lambda: len(link.peers) == 1)
             rude.send(*[Message(Request("GET_IMAGE"))] * 200)
-            await until(lambda: bool(link.farewells))
-            assert "read no answer" in link.farewells[0][1]
+            await until(lambda: bool(link.departures))
+            assert "read no answer" in link.departures[0][1]
             rude.writer.close()
 
     run(scene)
@@ -425,7 +424,7 @@ def test_peers_beyond_the_limit_are_refused() -> None:
             await until(lambda: len(link.peers) == 2)
             third = await client(port)
             assert await third.ends()
-            assert "refused" in link.farewells[0][1]
+            assert "refused" in link.departures[0][1]
             link.publish(picture(1, 8))
             await first.next()
             await second.next()

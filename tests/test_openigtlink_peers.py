@@ -16,14 +16,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from echospline.openigtlink.geometry import Attribute, Point, Points, PolyData
+from echospline.openigtlink import Link, LinkLimits, Message, Position, Status, String, Transform
 from echospline.openigtlink.image import Image
-from echospline.openigtlink.link import Link, LinkLimits
-from echospline.openigtlink.message import Message, Request
+from echospline.openigtlink.message import Request
 from echospline.openigtlink.ndarray import NDArrayMessage
 from echospline.openigtlink.peer import Peer
-from echospline.openigtlink.pose import Position, Transform
-from echospline.openigtlink.text import Capability, Status, String
+from echospline.openigtlink.polydata import Attribute, Point, Points, PolyData
+from echospline.openigtlink.text import Capability
 
 HERE = Path(__file__).parent / "openigtlink"
 EXAMPLES = Path("/usr/share/doc/openigtlink-examples/examples")

@@ -12,12 +12,18 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
-from echospline.image import UltrasoundImage
-from echospline.needle import NeedlePose
-from echospline.needle_echo import draw_needle
-from echospline.openigtlink.frames import frames_of, transform_between
-from echospline.openigtlink.scene import AXIAL, ImagingPlane, Reach, TrackedNeedle
+from echospline.picture import draw_needle
+from echospline.scene import (
+    AXIAL,
+    ImagingPlane,
+    NeedlePose,
+    Reach,
+    RegularGrid,
+    TrackedNeedle,
+    UltrasoundImage,
+    frames_of,
+    transform_between,
+)
 
 GRID = RegularGrid((41, 31), (1.0, 1.0))  # 40 mm wide, 30 mm deep
 REACH = Reach()

@@ -15,26 +15,31 @@ from typer.testing import CliRunner
 
 from echospline.cli.app import app
 from echospline.cli.link import oriented
-from echospline.deformation import Deformation
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
-from echospline.image import UltrasoundImage
 from echospline.live import LiveEngine
-from echospline.needle import Insertion, NeedlePose
+from echospline.openigtlink import (
+    Looks,
+    Message,
+    Naming,
+    Position,
+    Rates,
+    Session,
+    SessionOptions,
+    Stage,
+    Status,
+    String,
+    Transform,
+    read_calibration,
+)
 from echospline.openigtlink.decoder import Decoder
-from echospline.openigtlink.geometry import Points, PolyData
 from echospline.openigtlink.image import Image
-from echospline.openigtlink.message import Message, Request, encode
+from echospline.openigtlink.message import Request, encode
 from echospline.openigtlink.orders import answer, order_of
-from echospline.openigtlink.picture import Looks
-from echospline.openigtlink.plus import read_calibration
-from echospline.openigtlink.pose import Position, Transform
-from echospline.openigtlink.scene import AXIAL, ImagingPlane, Reach
-from echospline.openigtlink.session import Session
-from echospline.openigtlink.stage import Rates, SessionOptions, Stage
-from echospline.openigtlink.text import Command, CommandReply, Status, String
-from echospline.openigtlink.tracking import Naming, Tracking
-from echospline.warp import warp
+from echospline.openigtlink.polydata import Points, PolyData
+from echospline.openigtlink.text import CommandMessage, CommandReply
+from echospline.openigtlink.transforms import Tracking
+from echospline.picture import Deformation, warp
+from echospline.scene import AXIAL, ImagingPlane, Insertion, NeedlePose, Reach, RegularGrid, UltrasoundImage
 
 GRID = RegularGrid((64, 48), (0.5, 0.5))
 MESH = RegularGrid.covering(GRID, (17, 13))
@@ -285,7 +290,7 @@ def test_orders_start_stop_reset_freeze_and_switch_the_model(console: Console) -
 
 
 def test_commands_are_answered_in_the_form_they_came(console: Console) -> None:
-    console.send(Message(Command(7, "Freeze"), "Slicer", version=2))
+    console.send(Message(CommandMessage(7, "Freeze"), "Slicer", version=2))
     reply = console.wait(lambda m: m.type == "RTS_COMMAND")
     assert reply.content == CommandReply(
         7, "", '<CommandReply Status="SUCCESS" Message="time stands still" />'
@@ -373,8 +378,8 @@ def test_the_session_ends_with_its_threads() -> None:
         (Message(String("freeze"), "Command"), "freeze", ""),
         (Message(String("Load liver.toml"), "CMD_7"), "load", "liver.toml"),
         (Message(String("<Command Name='LoadScenario' File='a.toml'/>"), "anything"), "load", "a.toml"),
-        (Message(Command(1, "switch_model", "fem")), "model", "fem"),
-        (Message(Command(1, "", "<Command Name='Reset'/>")), "reset", ""),
+        (Message(CommandMessage(1, "switch_model", "fem")), "model", "fem"),
+        (Message(CommandMessage(1, "", "<Command Name='Reset'/>")), "reset", ""),
     ],
 )
 def test_orders_are_understood(message: Message, name: str, argument: str) -> None:
@@ -402,7 +407,7 @@ def test_other_texts_are_no_orders(message: Message) -> None:
     ],
 )
 def test_bad_orders_are_refused_and_the_refusal_fits_its_message(text: str) -> None:
-    message = Message(Command(3, "", text))
+    message = Message(CommandMessage(3, "", text))
     with pytest.raises(InputError) as refusal:
         order_of(message)
     assert Decoder().feed(encode(answer(message, str(refusal.value), done=False)))[0].type == "RTS_COMMAND"
@@ -452,8 +457,8 @@ def test_pages_follow_the_tracker_that_steers_the_link(tmp_path: Path) -> None:
     """`echospline live --link`: what the tracker does is seen by the page's own engine."""
     from websockets.sync.client import connect  # noqa: PLC0415
 
+    from echospline.viewer import steer  # noqa: PLC0415
     from echospline.viewer.protocol import PoseCommand, decode_frame, encode_command  # noqa: PLC0415
-    from echospline.viewer.server import steer  # noqa: PLC0415
     from live_scene import running  # noqa: PLC0415
 
     with (

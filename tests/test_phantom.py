@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 from scipy import signal, stats
 
-from echospline.acoustic import channel_data
-from echospline.beamform import LinearArray
-from echospline.echo import Display, Echo
 from echospline.errors import InputError, MissingExtraError
-from echospline.grid import RegularGrid
-from echospline.phantom import Inclusion, Layer, Phantom, Scatterers, deposit
-from echospline.probe import CONVEX, LINEAR, Probe
+from echospline.laboratory import Inclusion, Layer, LinearArray, Phantom, Scatterers, channel_data
+from echospline.laboratory.phantom import deposit
+from echospline.scene import Display, Echo, RegularGrid, Transducer
+from echospline.scene.transducer import CONVEX, LINEAR
 
 GRID = RegularGrid((200, 200), (0.1, 0.1))
 QUIET = replace(LINEAR, snr=float("inf"))
@@ -196,9 +194,9 @@ def test_compounding_brings_the_envelope_closer_to_its_mean():
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: Probe(frequency=0.0), "frequency must be a positive number MHz"),
-        (lambda: Probe(sampling=8.0), "sampling must be at least 16 MHz"),
-        (lambda: Probe(snr=float("nan")), "snr must be a number"),
+        (lambda: Transducer(frequency=0.0), "frequency must be a positive number MHz"),
+        (lambda: Transducer(sampling=8.0), "sampling must be at least 16 MHz"),
+        (lambda: Transducer(snr=float("nan")), "snr must be a number"),
         (lambda: Inclusion((0, 0), (1, -1), 0), "positive half axes"),
         (lambda: Layer(3, 3, 0), "top above bottom"),
         (lambda: Layer(1, 3, float("nan")), "level in dB"),
@@ -219,6 +217,6 @@ def test_missing_simulator_names_the_command(monkeypatch):
     def absent(name):
         raise ImportError(name)
 
-    monkeypatch.setattr("echospline.acoustic.import_module", absent)
+    monkeypatch.setattr("echospline.laboratory.acoustic.import_module", absent)
     with pytest.raises(MissingExtraError, match="echospline\\[acoustic\\]"):
         channel_data(np.zeros((1, 2)), np.ones(1), LinearArray(5.0, 20.0, 0.3))

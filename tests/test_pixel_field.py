@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from echospline.grid import RegularGrid
-from echospline.mechanics.kernels import Elastic, ThinPlate
+from echospline.mechanics import Elastic, ThinPlate, TPSModel, TPSParameters
 from echospline.mechanics.pixel_field import FINE, coarse_grid, strides, taps
-from echospline.mechanics.tps import TPSModel, TPSParameters
+from echospline.scene import RegularGrid
 from paths import wandering
 
 BOUND = 0.005

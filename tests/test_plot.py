@@ -13,11 +13,10 @@ from matplotlib.collections import LineCollection
 from matplotlib.quiver import Quiver
 from PIL import Image
 
-from echospline.data import sample_image
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
-from echospline.needle import NeedlePose
-from echospline.plot import draw_summary, summary_figure
+from echospline.io import sample_image
+from echospline.picture.summary import draw_summary, summary_figure
+from echospline.scene import NeedlePose, RegularGrid
 
 IMAGE = sample_image()
 MESH = RegularGrid.covering(IMAGE.grid, (40, 30))

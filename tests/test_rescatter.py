@@ -6,18 +6,15 @@ import pytest
 from typer.testing import CliRunner
 
 from echospline.cli.app import app
-from echospline.deformation import Deformation
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
-from echospline.image import UltrasoundImage
 from echospline.io import read, read_image
-from echospline.phantom import Phantom
-from echospline.phantom_cine import phantom_pictures
-from echospline.probe import LINEAR
-from echospline.rescatter import FINE, rescatter
+from echospline.laboratory import Phantom, phantom_pictures, rescatter, speckle_statistics
+from echospline.laboratory.rescatter import FINE
+from echospline.laboratory.speckle import correlation_coefficient
+from echospline.picture import Deformation, warp
 from echospline.scenario import load
-from echospline.speckle import correlation_coefficient, speckle_statistics
-from echospline.warp import warp
+from echospline.scene import RegularGrid, UltrasoundImage
+from echospline.scene.transducer import LINEAR
 
 
 @pytest.fixture(scope="module")

@@ -12,13 +12,12 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from numba import njit
 
 from echospline.errors import InputError, SolverError
-from echospline.grid import Floats, RegularGrid
-from echospline.mechanics.anchored_kernel import AnchoredKernel
-from echospline.mechanics.kernels import Elastic, Kernel, ThinPlate
+from echospline.mechanics import AnchoredKernel, Elastic, Kernel, ThinPlate
 from echospline.mechanics.response import NO_TIP, Precision, Response
 from echospline.mechanics.row_sums import BLOCK, sum_block, sum_block_twice
 from echospline.mechanics.spline import factor
 from echospline.mechanics.tip_patch import COEFFICIENTS, DEGREE, NODES, PARTS, chebyshev
+from echospline.scene import Floats, RegularGrid
 
 GRID = RegularGrid((17, 13), (2.0, 2.0))
 KERNELS = [ThinPlate(), Elastic(0.45, 1.5)]

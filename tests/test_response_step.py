@@ -12,10 +12,8 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
 from threadpoolctl import threadpool_limits
 
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
-from echospline.mechanics.kernels import Elastic, ThinPlate
-from echospline.mechanics.tps import TPSModel, TPSParameters
-from echospline.needle import NeedlePose
+from echospline.mechanics import Elastic, ThinPlate, TPSModel, TPSParameters
+from echospline.scene import NeedlePose, RegularGrid
 from paths import wandering
 
 GRID = RegularGrid((27, 21), (40 / 26, 30 / 20))

@@ -9,11 +9,10 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
-from echospline.mechanics.tps import TPSParameters
-from echospline.models import MODELS, build_model
-from echospline.scenario import Scenario, describe, load, validated
-from echospline.sections import LandmarkSection
+from echospline.mechanics import TPSParameters
+from echospline.scenario import MODELS, Scenario, build_model, describe, load, validated
+from echospline.scenario.sections import LandmarkSection
+from echospline.scene import RegularGrid
 
 FULL = """
 format = 1

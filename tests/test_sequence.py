@@ -20,12 +20,9 @@ from typer.testing import CliRunner
 
 from echospline.cli.app import app
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
-from echospline.image import UltrasoundImage
-from echospline.needle import Insertion, NeedlePose
-from echospline.openigtlink.scene import ImagingPlane
-from echospline.sequence import SequenceWriter, read_sequence
-from echospline.simulate import simulate
+from echospline.io.sequence import SequenceWriter, read_sequence
+from echospline.picture import simulate
+from echospline.scene import ImagingPlane, Insertion, NeedlePose, RegularGrid, UltrasoundImage
 
 GRID = RegularGrid((48, 40), (0.5, 0.4))
 MESH = RegularGrid.covering(GRID, (13, 11))

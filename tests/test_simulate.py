@@ -8,12 +8,9 @@ import numpy as np
 import pytest
 
 from echospline.errors import FoldingError, InputError
-from echospline.grid import RegularGrid
-from echospline.image import UltrasoundImage
-from echospline.mechanics.tps import TPSModel, TPSParameters
-from echospline.needle import Insertion
-from echospline.needle_echo import NeedleEcho
-from echospline.simulate import frame_count, simulate
+from echospline.mechanics import TPSModel, TPSParameters
+from echospline.picture import NeedleEcho, frame_count, simulate
+from echospline.scene import Insertion, RegularGrid, UltrasoundImage
 
 IMAGE = UltrasoundImage.from_array(
     np.random.default_rng(0).integers(0, 255, (121, 161)).astype(np.uint8), (0.25, 0.25)

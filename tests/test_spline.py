@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.interpolate import RBFInterpolator
 
 from echospline.errors import EchosplineError, InputError
-from echospline.mechanics.kernels import Elastic, ThinPlate
+from echospline.mechanics import Elastic, ThinPlate
 from echospline.mechanics.spline import factor
 
 KERNELS = [ThinPlate(), Elastic(0.45, 1.5), Elastic(0.3, 0.7, "strain")]

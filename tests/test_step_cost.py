@@ -9,11 +9,9 @@ import numpy as np
 import pytest
 from numba.core.runtime import _nrt_python, rtsys
 
-from echospline.grid import RegularGrid
-from echospline.mechanics import fused, tps
+from echospline.mechanics import TPSModel, fused, tps
 from echospline.mechanics.tip_patch import NODES
-from echospline.mechanics.tps import TPSModel
-from echospline.needle import NeedlePose
+from echospline.scene import NeedlePose, RegularGrid
 
 BLOCKS = 13
 """Blocks of memory that the compiled part of a plain step asks for: one to refer to each of the nine arrays that it is

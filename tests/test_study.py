@@ -9,23 +9,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from echospline.accuracy import CLAMPED, HELD_OUT, Case, brute_force, observe, oracle
-from echospline.claims import claims
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
-from echospline.mechanics.fem import FEMModel
-from echospline.mechanics.kernels import Elastic, ThinPlate
-from echospline.mechanics.landmark_stiffness import landmark_stiffness
+from echospline.mechanics import Elastic, FEMModel, ThinPlate, TPSModel, landmark_stiffness
 from echospline.mechanics.spline import factor
-from echospline.mechanics.tps import TPSModel
-from echospline.metrics import field_error
-from echospline.models import build_model
-from echospline.needle import Insertion
-from echospline.report import table, write_report
-from echospline.scenario import validated
-from echospline.speed import mesh_of, savings
-from echospline.study import Extent, study
-from echospline.tissue import Circle, Region, Tissue
+from echospline.scenario import build_model, validated
+from echospline.scene import Circle, Insertion, Region, RegularGrid, Tissue, field_error
+from echospline.study import study, table, write_report
+from echospline.study.accuracy import CLAMPED, HELD_OUT, Case, brute_force, observe, oracle
+from echospline.study.claims import claims
+from echospline.study.paper import Extent
+from echospline.study.speed import mesh_of, savings
 
 TINY = Extent(
     nodes=(17, 13),

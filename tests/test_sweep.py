@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from echospline.errors import InputError, MissingExtraError
-from echospline.sweep import Task, sweep
+from echospline.study import Task, sweep
 
 sys.path.insert(0, str(Path(__file__).parent))
 from sweep_tasks import refuse_odd, square, square_and_die_once

@@ -5,8 +5,7 @@ import pytest
 from matplotlib.path import Path
 
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
-from echospline.tissue import Circle, Label, Layer, Polygon, Region, Tissue
+from echospline.scene import Circle, Label, Layer, Polygon, Region, RegularGrid, Tissue
 
 GRID = RegularGrid((41, 31), (1.0, 1.0))
 

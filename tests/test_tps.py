@@ -9,11 +9,9 @@ import pytest
 from scipy.interpolate import RBFInterpolator
 
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
+from echospline.mechanics import Elastic, ThinPlate, TPSModel, TPSParameters
 from echospline.mechanics.interaction import friction, needle_travel, relax
-from echospline.mechanics.kernels import Elastic, ThinPlate
-from echospline.mechanics.tps import TPSModel, TPSParameters
-from echospline.needle import Insertion, NeedlePose
+from echospline.scene import Insertion, NeedlePose, RegularGrid
 from paths import wandering
 
 GRID = RegularGrid((40, 30), (40 / 39, 30 / 29))

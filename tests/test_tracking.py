@@ -9,18 +9,14 @@ import pytest
 from scipy.io import loadmat
 from skimage.registration import optical_flow_ilk
 
-from echospline.beamform import LinearArray, delay_and_sum, demodulate, rigid_motion
-from echospline.block_matching import BlockMatching
-from echospline.carrier_phase import CarrierPhase, taken_back
-from echospline.echo import Echo, EchoCine
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
-from echospline.image import Cine, UltrasoundImage
-from echospline.kelvinlet import NeedleField
-from echospline.needle import NeedlePose
-from echospline.phantom import Phantom
-from echospline.probe import CONVEX, LINEAR
-from echospline.tracking import FlowTracker, Motion, Neighbours, regrid, track
+from echospline.laboratory import LinearArray, NeedleField, Phantom, delay_and_sum
+from echospline.laboratory.beamform import demodulate, rigid_motion
+from echospline.scene import Cine, Echo, EchoCine, NeedlePose, RegularGrid, UltrasoundImage
+from echospline.scene.transducer import CONVEX, LINEAR
+from echospline.tracking import BlockMatching, CarrierPhase, FlowTracker, track
+from echospline.tracking.carrier_phase import taken_back
+from echospline.tracking.tracker import Motion, Neighbours, regrid
 
 SIZES = {"linear": (LINEAR, 0.1), "convex": (CONVEX, 0.17)}
 

@@ -19,12 +19,12 @@ from echospline.cli.live import opener_for, scene_of
 from echospline.cli.options import scenario_from
 from echospline.cli.sessions import keyframes
 from echospline.errors import InputError
-from echospline.io.displacement import read_displacement
-from echospline.models import MODELS
-from echospline.needle import Insertion
+from echospline.io import read_displacement
+from echospline.live import Trace
+from echospline.scenario import MODELS
+from echospline.scene import Insertion
+from echospline.viewer import Sessions, score
 from echospline.viewer.protocol import SPLINE
-from echospline.viewer.scoring import Trace, score
-from echospline.viewer.sessions import Sessions
 from test_viewer_server import page
 
 PERIOD = 1 / 120

@@ -14,15 +14,13 @@ import pytest
 from PIL import Image
 from playwright.sync_api import expect
 
-from echospline.grid import RegularGrid
-from echospline.image import UltrasoundImage
 from echospline.live import Command, Snapshot
-from echospline.mechanics.kernels import Elastic, ThinPlate
+from echospline.mechanics import Elastic, ThinPlate
 from echospline.mechanics.spline import factor
-from echospline.needle import NeedlePose
-from echospline.needle_echo import NeedleEcho, draw_needle
+from echospline.picture import NeedleEcho, draw_needle
+from echospline.scene import NeedlePose, RegularGrid, UltrasoundImage
+from echospline.viewer import Settings
 from echospline.viewer.protocol import encode_frame
-from echospline.viewer.server import Settings
 from live_scene import IMAGE_GRID, MESH, running, scene
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")

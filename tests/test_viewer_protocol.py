@@ -12,16 +12,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from echospline.errors import ProtocolError
 from echospline.live import Command, LiveEngine, Snapshot
-from echospline.mechanics.kernels import Elastic, ThinPlate
+from echospline.mechanics import Elastic, ThinPlate
 from echospline.mechanics.spline import factor
-from echospline.needle import NeedlePose
+from echospline.scene import NeedlePose
 from echospline.viewer.protocol import (
     COMMAND_BYTES,
     FRAME_HEADER_BYTES,
     SPLINE_HEAD,
     PoseCommand,
-    ProtocolError,
     decode_command,
     decode_frame,
     decode_request,

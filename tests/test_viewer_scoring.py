@@ -19,18 +19,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
-from echospline.live import LiveEngine
-from echospline.needle import Insertion
+from echospline.live import LiveEngine, Recorder, Trace
 from echospline.scenario import load
-from echospline.viewer.exercise import (
-    Disc,
-    Exercise,
-    check_exercises,
-    default_exercises,
-)
-from echospline.viewer.scoring import Recorder, Trace, redirections, score, smoothness
-from echospline.viewer.sessions import Sessions, sessions_csv, trace_csv
+from echospline.scene import Insertion, RegularGrid
+from echospline.viewer import Disc, Exercise, Sessions, default_exercises, score, sessions_csv, trace_csv
+from echospline.viewer.exercise import check_exercises
+from echospline.viewer.scoring import redirections, smoothness
 from live_scene import EXERCISE, PAST, scene
 
 PERIOD = 0.01

@@ -15,7 +15,8 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from echospline.errors import InputError
-from echospline.image import UltrasoundImage
+from echospline.scene import UltrasoundImage
+from echospline.viewer import Sessions, Settings, build_app, serve
 from echospline.viewer.client import IN_FLIGHT
 from echospline.viewer.guard import Allowance, Guard
 from echospline.viewer.protocol import (
@@ -29,9 +30,7 @@ from echospline.viewer.protocol import (
     decode_frame,
     encode_command,
 )
-from echospline.viewer.scene import grey_bytes, tip_of
-from echospline.viewer.server import Settings, build_app, serve
-from echospline.viewer.sessions import Sessions
+from echospline.viewer.served_scene import grey_bytes, tip_of
 from live_scene import EXERCISE, IMAGE_GRID, MESH, running, scene, speckle
 
 

@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from echospline.deformation import Deformation
 from echospline.errors import FoldingError, InputError
-from echospline.grid import RegularGrid
-from echospline.image import UltrasoundImage
-from echospline.warp import warp
+from echospline.picture import Deformation, warp
+from echospline.scene import RegularGrid, UltrasoundImage
 
 RNG = np.random.default_rng(0)
 MESH = RegularGrid((11, 9), (2.0, 2.0))  # 20 x 16 mm

@@ -1,26 +1,26 @@
-"""One small tree of exceptions; every message says what was expected, what came and what to do."""
+"""One small tree of exceptions; each message gives the expectation, the input and the remedy."""
 
 from __future__ import annotations
 
 
 class EchosplineError(Exception):
-    """Anything that echospline itself reports."""
+    """Base of every exception that echospline raises."""
 
 
 class InputError(EchosplineError, ValueError):
-    """A file, an option or an argument is not what it must be; the command line exits with code 2."""
+    """A file, an option or an argument is invalid; the command line exits with code 2."""
 
 
 class ProtocolError(InputError):
-    """Bytes from the network are not what the protocol says; the peer that sent them is at fault."""
+    """Bytes from the network break the protocol; their sender is at fault."""
 
 
 class FoldingError(EchosplineError):
-    """A deformation folds the image over itself (Jacobian <= 0) and the caller asked to refuse that."""
+    """A deformation folds the image over itself (Jacobian <= 0) and the caller asked for an error."""
 
 
 class SolverError(EchosplineError):
-    """A linear system cannot be solved to the accuracy promised; says which landmarks or elements."""
+    """A linear system cannot be solved to the promised accuracy; the message names the landmarks or elements."""
 
 
 class MissingExtraError(EchosplineError, ImportError):

@@ -1,4 +1,4 @@
-"""The Typer application; every command lives in a file of its own and is registered here."""
+"""The Typer application; every command has a file of its own and is registered here."""
 
 from __future__ import annotations
 

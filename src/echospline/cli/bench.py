@@ -1,4 +1,4 @@
-"""``echospline bench``: how fast a step and a frame are on this machine."""
+"""``echospline bench``: time of a step and a frame on this machine."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from threadpoolctl import threadpool_limits
 
-from echospline.bench import run
+from echospline.study import benchmark
 
 
 def bench(
@@ -21,7 +21,7 @@ def bench(
     """Time steps and frames on this machine, against the display's 60 Hz and the haptic 1 kHz; under a minute."""
     say = Console(stderr=True, highlight=False)
     with say.status("…") as status, threadpool_limits(1):
-        rows = run(status.update)
+        rows = benchmark(status.update)
     if as_json:
         print(json.dumps([row.as_json() for row in rows], indent=2))
         return

@@ -13,10 +13,9 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from echospline.dataset import create_store, make_sample, write_summary
 from echospline.errors import InputError
 from echospline.scenario import load
-from echospline.sweep import Task, sweep
+from echospline.study import Task, create_store, make_sample, sweep, write_summary
 
 
 def dataset(
@@ -40,10 +39,10 @@ def dataset(
     """Draw insertions and image them: pictures, true displacement, needle mask and pose, one chunk per sample.
 
     Tissue, probe, needle path and speckle are drawn around the bases; sample i depends on its base, i and the seed alone,
-    and `scenarios/0000000.toml` makes it again (`echospline phantom`). A run that was interrupted goes on where it
-    stopped, and a larger --n adds samples.
+    and `scenarios/0000000.toml` makes it again (`echospline phantom`). An interrupted run resumes,
+    and a larger --n adds samples.
     """
-    with as_file(files("echospline.data").joinpath("dataset.toml")) as own:
+    with as_file(files("echospline").joinpath("data", "dataset.toml")) as own:
         bases = [str(path.resolve()) for path in scenarios or [own]]
         shapes = {(s.phantom.grid().shape, s.mesh.nodes) for s in map(load, map(Path, bases))}
         if len(shapes) > 1:

@@ -1,4 +1,4 @@
-"""``echospline study exvivo``: the paper's experiment on a recording, or on a phantom where the truth is known."""
+"""``echospline study exvivo``: the paper's experiment on a recording, or on a phantom with known motion."""
 
 from __future__ import annotations
 
@@ -15,30 +15,36 @@ from rich.console import Console
 from rich.progress import track as counted
 from rich.table import Table
 
-from echospline.calibrate import PRINTED
-from echospline.charts_exvivo import error_per_depth, motion_maps
+from echospline.atomic import give_name, part_of, writing
 from echospline.cli.phantom import phantom_into
 from echospline.cli.track import load, tracker
-from echospline.deformation import Deformation
-from echospline.echo import EchoCine
 from echospline.errors import InputError
-from echospline.exvivo import Fit, Regions, compared, fit, regions, tracker_error
-from echospline.grid import RegularGrid
-from echospline.image import Cine
-from echospline.io import read_displacement
-from echospline.io.needle_path import read_needle
-from echospline.io.part import give_name, part_of, writing
-from echospline.mechanics.fem import FEMModel
-from echospline.mechanics.green import GreenModel
-from echospline.mechanics.tps import TPSModel
-from echospline.models import build_model
-from echospline.needle import Insertion
-from echospline.phantom import Displacement
-from echospline.phantom_cine import displacement_of
-from echospline.report import figure, paragraph, table, write_report
-from echospline.scenario import Scenario
+from echospline.io import read_displacement, read_needle
+from echospline.laboratory import Displacement, displacement_of
+from echospline.mechanics import FEMModel, GreenModel, TPSModel
+from echospline.picture import Deformation
+from echospline.scenario import Scenario, build_model
 from echospline.scenario import load as load_scenario
-from echospline.unit_fields import ForceFields, Observation, SplineFields, UnitFields
+from echospline.scene import Cine, EchoCine, Insertion, RegularGrid
+from echospline.study import (
+    PRINTED,
+    Fit,
+    ForceFields,
+    Observation,
+    Regions,
+    SplineFields,
+    UnitFields,
+    compared,
+    error_per_depth,
+    figure,
+    fit,
+    motion_maps,
+    paragraph,
+    regions,
+    table,
+    tracker_error,
+    write_report,
+)
 
 KINDS = ("tps", "elastic", "fem")
 
@@ -83,8 +89,8 @@ def exvivo(
     """Repeat the paper's ex-vivo protocol (Figs. 4 and 5).
 
     The motion of 200 points in 2 x 3 mm ahead of the tip is tracked at several depths; thin plate spline, elastic kernel
-    and finite elements are fitted to it separately (RMSE), compared frame by frame with a paired test, and asked to
-    predict depths that they were not fitted to. On the phantom the truth is known: the tracker's own error stands beside.
+    and finite elements are fitted to it separately (RMSE), compared frame by frame with a paired test, and used to
+    predict depths outside the fit. On the phantom the truth is known, and the tracker's own error is reported too.
     """
     if (cine is None) != (needle is None):
         raise InputError("--cine and --needle belong together: where the needle is in every frame")
@@ -110,7 +116,7 @@ def exvivo(
         json.dump(result, sys.stdout, indent=1)
         print()
         return
-    _tell(result, out)
+    _print_summary(result, out)
 
 
 def study_exvivo(
@@ -128,7 +134,7 @@ def study_exvivo(
     quiet: bool,
     source: str,
 ) -> dict[str, Any]:
-    """Track, fit, test, draw and write the report; returns what ``exvivo.json`` holds."""
+    """Track, fit, test, draw and write the report; returns the content of ``exvivo.json``."""
     wrap: Callable[[Any], Any] = (
         iter
         if quiet
@@ -168,14 +174,14 @@ def study_exvivo(
 def _scene(path: Path | None) -> tuple[Scenario, Path]:
     if path is not None:
         return load_scenario(path), path.resolve().parent
-    with as_file(files("echospline.data").joinpath("exvivo.toml")) as inside:
+    with as_file(files("echospline").joinpath("data", "exvivo.toml")) as inside:
         return load_scenario(inside), Path.cwd()
 
 
 def _fields(
     scene: Scenario, folder: Path, mesh: RegularGrid, kind: str
 ) -> Callable[[Observation], UnitFields]:
-    """Return the model of that name as identification sees it; the laws are those linear in the parameters."""
+    """Build the unit fields of the model of that name; its laws are those linear in the parameters."""
     built = build_model(scene.with_values({**PRINTED, "model.kind": kind}), mesh, folder=folder)
     if isinstance(built, TPSModel):
         return lambda seen: SplineFields(built, seen)
@@ -295,7 +301,7 @@ SUMMARY = {
 
 
 def _summary(means: Mapping[str, float]) -> list[dict[str, Any]]:
-    """Means over the depths, one row per model, um."""
+    """Return the means over the depths, one row per model, um."""
     rows = []
     for kind in KINDS:
         values = {k: means.get(f"{kind}_{k}_mm") for k in SUMMARY if k != "model"}
@@ -305,7 +311,7 @@ def _summary(means: Mapping[str, float]) -> list[dict[str, Any]]:
     return rows
 
 
-def _tell(result: Mapping[str, Any], out: Path) -> None:
+def _print_summary(result: Mapping[str, Any], out: Path) -> None:
     console = Console()
     means = result["means"]
     for title, numbers in (

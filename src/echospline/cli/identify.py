@@ -11,9 +11,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from echospline.calibrate import calibrate
 from echospline.errors import InputError
-from echospline.sweep import Task, sweep
+from echospline.study import Task, calibrate, sweep
 
 
 def identify(
@@ -64,11 +63,11 @@ def identify(
     ] = None,
     json_: Annotated[bool, typer.Option("--json", help="print the reports as JSON, nothing else")] = False,
 ) -> None:
-    """Find the parameters with which a model answers as the tissue did.
+    """Find the parameters with which a model fits the observed displacement.
 
-    Writes `identified.toml` (run it with `echospline simulate`), `identification.json` (errors, 95 % intervals, what the
-    data cannot tell apart) and `error_map.png`. Several fields run one after another, on `--workers` or on a cluster;
-    each result is on disk as soon as it is known, and a run that was interrupted goes on where it stopped.
+    Writes `identified.toml` (run it with `echospline simulate`), `identification.json` (errors, 95 % intervals, combinations
+    that the data do not determine) and `error_map.png`. Several fields run one after another, on `--workers` or on a cluster;
+    each result is written as soon as its task ends, and an interrupted run resumes.
     """
     names = _names(fields)
     tasks = []
@@ -91,14 +90,14 @@ def identify(
         json.dump({"reports": reports, "failed": failed}, sys.stdout, indent=1)
         print()
     else:
-        _tell(reports, out)
+        _print_summary(reports, out)
     if failed:
         name, why = next(iter(failed.items()))
         raise InputError(f"{len(failed)} of {len(tasks)} fields could not be identified; {name}: {why}")
 
 
 def _names(fields: list[str]) -> list[str]:
-    """One name per field, from its file or folder, numbered where two are alike."""
+    """Name each field after its file or folder, numbered where two are equal."""
     stems = []
     for field in fields:
         path = Path(field).resolve()
@@ -109,7 +108,7 @@ def _names(fields: list[str]) -> list[str]:
     return [s if stems.count(s) == 1 else f"{s}-{i + 1}" for i, s in enumerate(stems)]
 
 
-def _tell(reports: dict[str, Any], out: Path) -> None:
+def _print_summary(reports: dict[str, Any], out: Path) -> None:
     console = Console()
     for name, report in reports.items():
         table = Table(title=f"{name}: {report['model']}, {report['method']}", title_justify="left")

@@ -1,4 +1,4 @@
-"""``echospline info``: what a file holds, before anything is done with it."""
+"""``echospline info``: the content of a file, before anything is done with it."""
 
 from __future__ import annotations
 
@@ -13,13 +13,20 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from echospline import scenario
-from echospline.data import SAMPLES, sample_image
 from echospline.errors import InputError
-from echospline.io.displacement import displacement_shapes, read_displacement
-from echospline.io.kind import kind_of
-from echospline.io.reading import SAMPLE, open_recording
-from echospline.io.recording import LIMIT, MIB, Recording
+from echospline.io import (
+    LIMIT,
+    MIB,
+    SAMPLE,
+    SAMPLES,
+    Recording,
+    displacement_shapes,
+    kind_of,
+    open_recording,
+    read_displacement,
+    sample_image,
+)
+from echospline.scenario import LARGEST_FILE, Scenario, load
 
 
 def info(
@@ -40,7 +47,7 @@ def info(
         ),
     ] = LIMIT,
 ) -> None:
-    """Say what a file holds: format, pixels, spacing, size in mm, frames and times, and what to doubt."""
+    """Describe a file: format, pixels, spacing, size in mm, frames and times, and doubts."""
     found = describe(file, limit)
     if as_json:
         print(json.dumps(found, indent=2))
@@ -55,7 +62,7 @@ def info(
 
 
 def describe(file: str, limit: float = LIMIT) -> dict[str, Any]:
-    """Gather what a file holds, in words and numbers that JSON can carry.
+    """Describe the content of a file in values for JSON.
 
     Parameters
     ----------
@@ -168,20 +175,18 @@ def _of_displacement(path: Path, limit: float) -> dict[str, Any]:
 
 
 def _of_toml(path: Path) -> dict[str, Any]:
-    """Describe a scenario; of another TOML file its tables alone."""
-    if path.stat().st_size > scenario.LARGEST_FILE:
-        raise InputError(
-            f"{path} has {path.stat().st_size:,} bytes; a scenario has {scenario.LARGEST_FILE:,} at most"
-        )
+    """Describe a scenario; of another TOML file, list its tables."""
+    if path.stat().st_size > LARGEST_FILE:
+        raise InputError(f"{path} has {path.stat().st_size:,} bytes; a scenario has {LARGEST_FILE:,} at most")
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path} is no valid TOML: {' '.join(str(error).split())}") from error
-    if not set(document) & set(scenario.Scenario.model_fields):
+    if not set(document) & set(Scenario.model_fields):
         return {"format": "TOML, no scenario", "tables": _tables(document), "notes": []}
     about: dict[str, Any] = {"format": "TOML scenario", "tables": _tables(document), "notes": []}
     try:
-        run = scenario.load(path)
+        run = load(path)
     except InputError as error:
         about["notes"].append(f"cannot be run: {error}")
     else:
@@ -199,12 +204,12 @@ def _tables(document: dict[str, Any]) -> dict[str, Any]:
 
 
 def _size(columns: int, rows: int, spacing: tuple[float, float]) -> list[float]:
-    """Width and depth in mm, whole pixels included."""
+    """Return the width and depth in mm, whole pixels included."""
     return [round(columns * spacing[0], 4), round(rows * spacing[1], 4)]
 
 
 def _lines(key: str, value: Any) -> list[str]:
-    """Return a value as a person reads it, a line for each thing."""
+    """Return a value as lines of text for display."""
     shown = _SHOWN.get(key)
     return [_short(value)] if shown is None or value is None else shown(value) or ["none"]
 

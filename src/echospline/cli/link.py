@@ -1,4 +1,4 @@
-"""``echospline link``: a tracker or 3D Slicer drives the needle over OpenIGTLink and gets the deforming image back."""
+"""``echospline link``: a tracker or 3D Slicer moves the needle over OpenIGTLink and receives the deforming image."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ from threadpoolctl import threadpool_limits
 
 from echospline.cli.options import scenario_from, with_scenario_options
 from echospline.errors import InputError
-from echospline.image import UltrasoundImage
 from echospline.live import LiveEngine
-from echospline.models import MODELS, build_model
-from echospline.needle import NeedlePose
-from echospline.openigtlink.link import PORT
-from echospline.openigtlink.picture import Looks
-from echospline.openigtlink.plus import read_calibration
-from echospline.openigtlink.scene import Reach
-from echospline.openigtlink.session import Session
-from echospline.openigtlink.stage import Rates, SessionOptions, Stage
-from echospline.openigtlink.tracking import Naming
-from echospline.scenario import Scenario, load
+from echospline.openigtlink import (
+    PORT,
+    Looks,
+    Naming,
+    Rates,
+    Session,
+    SessionOptions,
+    Stage,
+    read_calibration,
+)
+from echospline.scenario import MODELS, Scenario, build_model, load
+from echospline.scene import NeedlePose, Reach, UltrasoundImage
 
 AXES = {
     "x": (1.0, 0.0, 0.0), "-x": (-1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0),
@@ -71,7 +72,7 @@ def link(
         str, typer.Option(metavar="AXIS", help="direction of insertion in that frame: x, -x, y, -y, z, -z")
     ] = "z",
     reference: Annotated[
-        str, typer.Option(metavar="FRAME", help="frame that everything is told in")
+        str, typer.Option(metavar="FRAME", help="frame of all positions sent")
     ] = "Reference",
     image_name: Annotated[
         str, typer.Option(metavar="NAME", help="device name and frame of the image")
@@ -162,7 +163,7 @@ def link(
             raise InputError(f"a scenario is named NAME.toml, without folders; got {name!r}")
         return make_stage(load(scenarios / name), scenarios, orientation, rate, [])
 
-    # An engine's step is short: more threads make it slower, and late.
+    # An engine's step is short: more threads make it slower and less punctual.
     with threadpool_limits(limits=1), Session(stage, options, load_named if scenarios else None) as session:
         if not quiet:
             where = f"OpenIGTLink on {host}:{session.port}" if serve else "OpenIGTLink"
@@ -180,20 +181,20 @@ def make_stage(
     rate: float = 120.0,
     targets: list[tuple[float, float]] | None = None,
 ) -> Stage:
-    """Image, tissue and needle of a scenario, ready to run live.
+    """Build the image, tissue and needle of a scenario, ready to run live.
 
     Parameters
     ----------
     scenario : Scenario
-        What is simulated.
+        The scenario to simulate.
     folder : Path
-        Where its relative paths start.
+        Start of its relative paths.
     orientation : {"MF", "UF", "MN", "UN"}
-        Which way the picture lies in its file.
+        Orientation of the picture in its file.
     rate : float
         Steps per second.
     targets : list of (x, y)
-        Points that are followed, mm.
+        Points whose motion is reported, mm.
     """
     image = oriented(scenario.read_image(folder), orientation)
     grid = scenario.grid(image)
@@ -236,7 +237,7 @@ def _summary(stage: Stage) -> str:
 
 
 def address(text: str) -> tuple[str, int]:
-    """Host and port of ``HOST:PORT``; without a port OpenIGTLink's own.
+    """Split ``HOST:PORT`` into host and port; without a port OpenIGTLink's own.
 
     Raises
     ------
@@ -260,7 +261,7 @@ def _point(text: str) -> tuple[float, float]:
 
 
 def axis_of(text: str) -> tuple[float, float, float]:
-    """Unit vector of ``x``, ``-x``, ... ``-z``.
+    """Return the unit vector of ``x``, ``-x``, ... ``-z``.
 
     Raises
     ------

@@ -17,20 +17,11 @@ from threadpoolctl import threadpool_limits
 from echospline.cli.link import address, make_stage
 from echospline.cli.options import scenario_from, with_scenario_options
 from echospline.errors import InputError
-from echospline.image import UltrasoundImage
-from echospline.models import MODELS, build_model
-from echospline.needle_echo import NeedleEcho
-from echospline.openigtlink.link import PORT
-from echospline.openigtlink.picture import Looks
-from echospline.openigtlink.plus import read_calibration
-from echospline.openigtlink.session import Session
-from echospline.openigtlink.stage import Rates, SessionOptions
-from echospline.openigtlink.tracking import Naming
-from echospline.scenario import Scenario
-from echospline.viewer.exercise import default_exercises
-from echospline.viewer.scene import Scene
-from echospline.viewer.server import Settings, build_app, serve, steer
-from echospline.viewer.sessions import Sessions
+from echospline.openigtlink import PORT, Looks, Naming, Rates, Session, SessionOptions, read_calibration
+from echospline.picture import NeedleEcho
+from echospline.scenario import MODELS, Scenario, build_model
+from echospline.scene import UltrasoundImage
+from echospline.viewer import Scene, Sessions, Settings, build_app, default_exercises, serve, steer
 
 LABELS = {"tps": "TPS", "elastic": "Elastic", "green": "Green", "fem": "FEM"}
 
@@ -92,14 +83,14 @@ def live(
     """Steer the needle in the browser and see the tissue move.
 
     Starts a server on this machine and opens its page; Ctrl+C ends it. Without an argument it shows the image that ships
-    inside. Finished exercises are kept (`echospline sessions` lists and exports them).
+    with the package. Finished exercises are kept (`echospline sessions` lists and exports them).
     """
     scenario, folder = scenario_from(source, changes or {})
     image = scenario.read_image(folder)
     scene = scene_of(scenario, image, folder)
     settings = Settings(host, port, rate, clients, nodes=nodes)
     kept = Sessions(sessions or default_sessions())
-    scene.models(scene.names[0][0])  # refuses what makes no model, and compiles, before a page waits for it
+    scene.models(scene.names[0][0])  # refuses an invalid scenario, and compiles, before a page waits for it
     app = build_app(scene, kept, settings, opener_for(scenario))
     console = Console(stderr=True)
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
@@ -113,7 +104,7 @@ def live(
     with ExitStack() as stack:
         stack.enter_context(
             threadpool_limits(limits=1)
-        )  # an engine's step is short: more threads make it slower, and late
+        )  # an engine's step is short: more threads make it slower and less punctual
         if link or link_connect:
             session = Session(
                 make_stage(scenario, folder, rate=rate),
@@ -134,7 +125,7 @@ def live(
 
 
 def scene_of(scenario: Scenario, image: UltrasoundImage, folder: Path) -> Scene:
-    """Scene of a scenario: its image, mesh and needle, every model, its exercises or the usual three.
+    """Build the scene of a scenario: its image, mesh and needle, every model, its exercises or the default three.
 
     Raises
     ------
@@ -168,13 +159,13 @@ def scene_of(scenario: Scenario, image: UltrasoundImage, folder: Path) -> Scene:
 
 
 def _whole(scenario: Scenario, folder: Path) -> str:
-    """Name of the image that is valid from anywhere."""
+    """Return the name of the image that is valid in every folder."""
     file = scenario.image.file
     return file if file.startswith("sample:") else str((folder / file).resolve())
 
 
 def opener_for(scenario: Scenario) -> Callable[[Path, tuple[float, float] | None], Scene]:
-    """Make uploaded images into scenes with the tissue, mesh and model of a scenario."""
+    """Build a function that turns uploaded images into scenes with the tissue, mesh and model of a scenario."""
 
     def opened(path: Path, spacing: tuple[float, float] | None) -> Scene:
         values: dict[str, Any] = {"title": "Your image", "image.file": str(path), "image.spacing": spacing, "image.frame": 0,

@@ -1,6 +1,6 @@
-"""Command-line options that stand for keys of a scenario: flag, key, how the text is read.
+"""Command-line options that stand for keys of a scenario: flag, key and parser of the text.
 
-The help text, range and default of every option come from the scenario's own tables, so they are written once.
+The help text, range and default of every option come from the scenario's own tables, so that they are written once.
 """
 
 from __future__ import annotations
@@ -142,12 +142,12 @@ def scenario_from(source: str, changes: dict[str, Any]) -> tuple[Scenario, Path]
     -------
     scenario : Scenario
     folder : Path
-        Where its relative paths start.
+        Start of its relative paths.
 
     Raises
     ------
     InputError
-        If the file or an option is not what it must be.
+        If the file or an option is invalid.
     """
     if source.lower().endswith(".toml"):
         scenario, folder = load(source), Path(source).resolve().parent
@@ -156,7 +156,7 @@ def scenario_from(source: str, changes: dict[str, Any]) -> tuple[Scenario, Path]
         changes = {"image.file": source, **changes}
     try:
         return scenario.with_values({k: _read(k, v) for k, v in changes.items()}, "options"), folder
-    except InputError as error:  # the user wrote a flag, not a key
+    except InputError as error:  # the message names the user's flag, not the key
         flag = next(
             (o.flag for o in OPTIONS if str(error).startswith(f"options: {o.key}") and o.key in changes), None
         )

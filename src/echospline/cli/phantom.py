@@ -14,18 +14,13 @@ from rich.console import Console
 from rich.progress import track as counted
 
 from echospline.cli.options import scenario_from, with_scenario_options
-from echospline.echo import Echo
 from echospline.errors import InputError
-from echospline.image import UltrasoundImage
-from echospline.io import open_writer
-from echospline.io.echoes import EchoWriter
-from echospline.models import build_model
-from echospline.phantom import Phantom
-from echospline.phantom_cine import phantom_pictures
-from echospline.run import run
-from echospline.scenario import PHANTOM, Scenario
-from echospline.simulate import frame_count
-from echospline.speckle import speckle_statistics
+from echospline.io import EchoWriter, open_writer
+from echospline.laboratory import Phantom, phantom_pictures, speckle_statistics
+from echospline.picture import frame_count
+from echospline.scenario import PHANTOM, Scenario, build_model
+from echospline.scenario.run import run
+from echospline.scene import Echo, UltrasoundImage
 
 
 @with_scenario_options
@@ -45,9 +40,9 @@ def phantom(
 ) -> None:
     """Image a phantom of point scatterers while a needle deforms it.
 
-    The tissue model of the scenario moves the scatterers, and every frame is imaged anew: speckle decorrelates as in
+    The tissue model of the scenario moves the scatterers, and every frame is formed from them: speckle decorrelates as in
     tissue. Writes the cine, `displacement.npz` (the true motion), `echoes.npz` (for `track`), `summary.png`,
-    `scenario.toml` and `run.json`. The tables [probe] and [phantom] say what is imaged and how.
+    `scenario.toml` and `run.json`. The tables [probe] and [phantom] describe probe and phantom.
     """
     if not source.lower().endswith(".toml"):
         raise InputError(
@@ -69,7 +64,7 @@ def phantom_into(
     scenario: Scenario, out: Path, folder: Path, *, echoes: bool, rf: bool = False, quiet: bool = True
 ) -> dict[str, Any]:
     """Run a scenario on its phantom; returns the report of `run` with a table ``phantom``."""
-    # the resolved scenario names its own picture, so that simulate and identify find the mesh where it was
+    # the resolved scenario names its own picture, so that simulate and identify use the same mesh
     scenario = scenario.with_values({"image.file": PHANTOM, "image.region": None, "image.spacing": None})
     section, probe = scenario.phantom, scenario.probe.probe()
     scattered = section.phantom(probe)
@@ -110,7 +105,7 @@ def phantom_into(
 
 
 def described(phantom: Phantom, still: Echo) -> dict[str, Any]:
-    """Say what was imaged, and the statistics of its speckle at rest."""
+    """Describe the phantom, and the statistics of its speckle at rest."""
     found = speckle_statistics(still.envelope(), still.grid.spacing)
     return {
         "scatterers": len(phantom.scatterers.amplitudes),

@@ -1,4 +1,4 @@
-"""``echospline recorded``: a tracked procedure, simulated again and compared with what was seen."""
+"""``echospline recorded``: a tracked procedure, simulated again and compared with its pictures."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ import numpy as np
 import typer
 from threadpoolctl import threadpool_limits
 
+from echospline.atomic import part_of, writing
 from echospline.cli.link import axis_of
 from echospline.cli.options import scenario_from, with_scenario_options
 from echospline.errors import InputError
-from echospline.image import Pixels
-from echospline.io.part import part_of, writing
-from echospline.models import build_model
-from echospline.openigtlink.plus import read_calibration
-from echospline.sequence import SequenceWriter, read_sequence
-from echospline.simulate import simulate
+from echospline.io.sequence import SequenceWriter, read_sequence
+from echospline.openigtlink import read_calibration
+from echospline.picture import simulate
+from echospline.scenario import build_model
+from echospline.scene import Pixels
 
 
 @with_scenario_options
@@ -54,7 +54,7 @@ def recorded(
 
     The first good frame is the tissue at rest, the tracked transforms are the needle's path; model and mesh come from the
     options. Writes `resimulated.igs.mha` and `comparison.csv`: for each frame the correlation of the recorded picture with
-    the simulated one, and with the first frame (what one gets by doing nothing).
+    the simulated one, and with the first frame (the result without a simulation).
     """
     scenario, folder = scenario_from(str(file), changes or {})
     sequence = read_sequence(file)
@@ -106,7 +106,7 @@ def recorded(
 
 
 def correlation(first: Pixels, second: Pixels) -> float:
-    """Normalised cross-correlation of two pictures, -1 to 1; 0 where one is uniform."""
+    """Compute the normalised cross-correlation of two pictures, -1 to 1; 0 where one is uniform."""
     a, b = first.astype(np.float64), second.astype(np.float64)
     a, b = a - a.mean(), b - b.mean()
     scale = float(np.sqrt((a * a).sum() * (b * b).sum()))

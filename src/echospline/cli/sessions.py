@@ -1,4 +1,4 @@
-"""``echospline sessions``: list, export and score again what was trained, and make a cine of it."""
+"""``echospline sessions``: list, export and score training sessions again, and make a cine of one."""
 
 from __future__ import annotations
 
@@ -13,11 +13,10 @@ from rich.table import Table
 
 from echospline.cli.live import default_sessions
 from echospline.errors import InputError
-from echospline.models import build_model
-from echospline.run import run
-from echospline.scenario import validated
-from echospline.viewer.scoring import Trace, score
-from echospline.viewer.sessions import Sessions, sessions_csv, trace_csv
+from echospline.live import Trace
+from echospline.scenario import build_model, validated
+from echospline.scenario.run import run
+from echospline.viewer import Sessions, score, sessions_csv, trace_csv
 
 sessions = typer.Typer(
     no_args_is_help=True, help="Training sessions: list, export, score again, make a cine."
@@ -110,7 +109,7 @@ def cine(
 
 
 def keyframes(trace: Trace) -> list[tuple[float, float, float, float, float]]:
-    """Rows of time, entry and tip for a scenario's path, at most 60 a second, first and last included."""
+    """Return the rows of time, entry and tip for a scenario's path, at most 60 a second, first and last included."""
     if len(trace) < 2:
         raise InputError("this session holds no motion")
     stride = max(1, int(1.0 / (KEYFRAMES_PER_SECOND * trace.period)))

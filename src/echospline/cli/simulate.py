@@ -14,12 +14,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from echospline.cli.options import scenario_from, with_scenario_options
-from echospline.image import UltrasoundImage
-from echospline.models import build_model
-from echospline.rescatter import rescatter
-from echospline.run import run
-from echospline.scenario import Scenario
-from echospline.simulate import ImageFormer
+from echospline.laboratory import rescatter
+from echospline.picture import ImageFormer
+from echospline.scenario import Scenario, build_model
+from echospline.scenario.run import run
+from echospline.scene import UltrasoundImage
 
 Out = Annotated[Path, typer.Option("--out", help="folder for the results, made where it is not there")]
 Json = Annotated[bool, typer.Option("--json", help="print the report of the run as JSON, nothing else")]
@@ -42,19 +41,19 @@ def simulate(
 
     Writes the cine, `displacement.npz` (the true motion), `summary.png`, `scenario.toml` (the run, resolved: running it
     again gives the same numbers) and `run.json` (parameters, versions, time per stage) into the folder. Options
-    replace what the scenario says.
+    replace values of the scenario.
     """
     simulate_into(source, out, changes or {}, as_json=json_)
 
 
 def demo(out: Out = Path("out/demo"), json_: Json = False) -> None:
-    """Run the main job on the image that ships inside: a needle into calf muscle, in and out again."""
-    with as_file(files("echospline.data").joinpath("demo.toml")) as scenario:
+    """Run the main job on the image that ships with the package: a needle into calf muscle, in and out again."""
+    with as_file(files("echospline").joinpath("data", "demo.toml")) as scenario:
         simulate_into(str(scenario), out, {}, as_json=json_)
 
 
 def simulate_into(source: str, out: Path, changes: dict[str, Any], *, as_json: bool) -> None:
-    """Run a scenario with a progress bar on a terminal, and say what came out."""
+    """Run a scenario with a progress bar on a terminal, and print a summary."""
     scenario, folder = scenario_from(source, changes)
     image = scenario.read_image(folder)
     model = build_model(scenario, scenario.grid(image), folder=folder)
@@ -82,11 +81,11 @@ def simulate_into(source: str, out: Path, changes: dict[str, Any], *, as_json: b
         json.dump(report, sys.stdout, indent=2)
         print()
         return
-    _tell(report, out)
+    _print_summary(report, out)
 
 
 def _image_former(scenario: Scenario, image: UltrasoundImage) -> ImageFormer | None:
-    """Return what forms the pictures where it is not the warp."""
+    """Return the image former, where it is not the warp."""
     if scenario.output.image_model == "warp":
         return None
     section = scenario.phantom
@@ -95,7 +94,7 @@ def _image_former(scenario: Scenario, image: UltrasoundImage) -> ImageFormer | N
     )
 
 
-def _tell(report: dict[str, Any], out: Path) -> None:
+def _print_summary(report: dict[str, Any], out: Path) -> None:
     console = Console()
     table = Table(title=f"{report['frames']} frames in {report['seconds']:.1f} s", title_justify="left")
     table.add_column("stage")

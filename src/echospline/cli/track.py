@@ -14,19 +14,21 @@ import typer
 from rich.console import Console
 from rich.progress import track as counted
 
-from echospline.block_matching import BlockMatching
-from echospline.echo import Echo, EchoCine
 from echospline.errors import InputError
-from echospline.grid import Floats, RegularGrid
-from echospline.image import Cine
-from echospline.io import read
-from echospline.io.echoes import read_echoes
-from echospline.io.kind import head
-from echospline.io.needle_path import read_needle
-from echospline.io.tracks import write_track
-from echospline.needle import NeedlePose
-from echospline.region import grid_over, inside_ahead, region_ahead
-from echospline.tracking import FlowTracker, Reference, Track, Tracker, grey_pair
+from echospline.io import head, read, read_echoes, read_needle
+from echospline.scene import Cine, Echo, EchoCine, Floats, NeedlePose, RegularGrid
+from echospline.tracking import (
+    BlockMatching,
+    FlowTracker,
+    Reference,
+    Track,
+    Tracker,
+    grey_pair,
+    grid_over,
+    inside_ahead,
+    region_ahead,
+    write_track,
+)
 from echospline.tracking import track as follow
 
 
@@ -115,7 +117,7 @@ def track(
         progress=wrap,
     )
     if ahead is not None and poses is not None:
-        # outside of the region of its frame a point is not asked for
+        # a point outside the region of its frame is not needed
         here = np.stack([inside_ahead(points, pose, ahead) for pose in poses])
         found = Track(found.points, found.times, found.displacement, found.confidence * here, found.keyframes)
     write_track(out, found, poses)
@@ -192,7 +194,7 @@ def numbers(text: str, count: int, option: str) -> list[float]:
 
 
 def swept(poses: Iterable[NeedlePose], distance: float, grid: RegularGrid) -> Floats:
-    """Points of the region ahead of the tip over all frames, on one lattice of 0.2 mm, inside the picture."""
+    """Return the points of the region ahead of the tip over all frames, on one lattice of 0.2 mm, inside the picture."""
     found = [region_ahead(pose, distance) for pose in poses if pose.depth > 0]
     points = np.concatenate(found) if found else np.empty((0, 2))
     lattice = np.unique(np.rint(points / 0.2).astype(int), axis=0) * 0.2
@@ -203,7 +205,7 @@ def swept(poses: Iterable[NeedlePose], distance: float, grid: RegularGrid) -> Fl
 
 
 def summary(found: Track, seconds: float) -> dict[str, Any]:
-    """Say what was found."""
+    """Print a summary of the motion."""
     trusted = found.confidence >= 0.3
     size = np.hypot(found.displacement[..., 0], found.displacement[..., 1])
     return {
@@ -219,8 +221,8 @@ def summary(found: Track, seconds: float) -> dict[str, Any]:
 
 def draw(frames: Cine | EchoCine, found: Track, poses: list[NeedlePose] | None, path: Path) -> None:
     """Draw the arrows of the frame that moved most over the first picture."""
-    # matplotlib takes long to load
-    from echospline.plot import tracking_figure  # noqa: PLC0415
+    # matplotlib is slow to load
+    from echospline.picture.summary import tracking_figure  # noqa: PLC0415
 
     grey, _, grid = grey_pair(frames[0], frames[0])
     size = np.hypot(found.displacement[..., 0], found.displacement[..., 1]) * (found.confidence >= 0.3)

@@ -14,12 +14,11 @@ from typing import IO, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from echospline.atomic import give_name, part_of, writing
 from echospline.errors import InputError
-from echospline.grid import Floats, RegularGrid, as_points
 from echospline.io.kind import head
-from echospline.io.part import give_name, part_of, writing
 from echospline.io.recording import LIMIT, MIB, decoding
-from echospline.needle import NeedlePose
+from echospline.scene import Floats, NeedlePose, RegularGrid, as_points
 
 KEYS = ("points", "displacement", "times", "tip", "entry", "speed")
 _HEADER = 128
@@ -29,7 +28,7 @@ _BLOCK = 2**20
 
 @dataclass(frozen=True)
 class DisplacementRecord:
-    """How mesh nodes moved while a needle did.
+    """Displacement of mesh nodes while a needle moved.
 
     Parameters
     ----------
@@ -102,8 +101,8 @@ class DisplacementRecord:
 class DisplacementWriter:
     """Writes ``displacement.npz`` frame by frame: fields go to the disk at once, only times and poses are kept.
 
-    Memory grows by a few hundred bytes a frame. While it writes, fields lie in ``NAME.part``, a plain ``.npy`` array whose header
-    is kept true after every frame, so that a killed run leaves its fields readable (``numpy.load``).
+    Memory grows by a few hundred bytes a frame. Until `close`, the fields are in ``NAME.part``, a plain ``.npy`` array whose header
+    is updated after every frame, so that a killed run leaves its fields readable (``numpy.load``).
 
     Parameters
     ----------
@@ -164,7 +163,7 @@ class DisplacementWriter:
             self._file.write(self._header())
 
     def close(self) -> None:
-        """Gather everything into the final file; a second call does nothing."""
+        """Write everything into the final file; a second call does nothing."""
         if self._closed:
             return
         self._closed = True
@@ -237,7 +236,7 @@ def read_displacement(path: str | Path, *, limit: float = LIMIT) -> Displacement
 
 
 def displacement_shapes(path: str | Path) -> dict[str, tuple[int, ...]]:
-    """Shapes that a displacement record declares, checked against the bytes it holds; no array is read.
+    """Return the shapes that a displacement record declares, checked against the bytes it holds; no array is read.
 
     Raises
     ------
@@ -254,7 +253,7 @@ def displacement_shapes(path: str | Path) -> dict[str, tuple[int, ...]]:
 def _declared(
     archive: zipfile.ZipFile, path: Path, name: str
 ) -> tuple[tuple[int, ...], np.dtype[np.generic], bool]:
-    """Shape, type and order in a member's header; refused unless they account for the member's size."""
+    """Return the shape, type and order in a member's header; refused unless they account for the member's size."""
     if f"{name}.npy" not in archive.namelist():
         raise InputError(f"{path} lacks the array {name!r}; expected {', '.join(KEYS)}")
     with archive.open(f"{name}.npy") as member:

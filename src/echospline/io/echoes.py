@@ -1,4 +1,4 @@
-"""``echoes.npz``: complex baseband frames beside their grid and carrier, written frame by frame, read checked."""
+"""``echoes.npz``: complex baseband frames with their grid and carrier, written frame by frame and checked when read."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ from typing import IO, Self
 
 import numpy as np
 
-from echospline.echo import Echo, EchoCine
+from echospline.atomic import give_name, part_of, writing
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
-from echospline.io.part import give_name, part_of, writing
 from echospline.io.recording import LIMIT, MIB, decoding
+from echospline.scene import Echo, EchoCine, RegularGrid
 
 KEYS = ("iq", "times", "spacing", "origin", "carrier")
 
@@ -29,7 +28,7 @@ class EchoWriter:
     path : Path
         Ends in ``.npz``.
     frames : int
-        How many will come.
+        Number of frames.
     grid : RegularGrid
         Of the samples.
     carrier : float

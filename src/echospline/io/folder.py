@@ -1,4 +1,4 @@
-"""A cine as a folder of numbered pictures, as many recordings are handed on; ``times.csv`` beside them is read too."""
+"""A cine as a folder of numbered pictures, a common form of recordings; ``times.csv`` in it is read too."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from echospline.errors import InputError
-from echospline.grid import Floats
-from echospline.image import Pixels
 from echospline.io.kind import kind_of
-from echospline.io.picture import open_picture
 from echospline.io.recording import Recording, check_size, decoding
+from echospline.io.still import open_picture
+from echospline.scene import Floats, Pixels
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 _TABLE = "times.csv"
@@ -28,11 +27,11 @@ def open_folder(path: Path, limit: float, *, whole: bool) -> Recording:
     Parameters
     ----------
     path : Path
-        The folder; files other than pictures are left alone.
+        The folder; other files are ignored.
     limit : float
         MiB of decoded pixels, of all frames or of one.
     whole : bool
-        Whether all frames are wanted.
+        Whether all frames are needed.
 
     Raises
     ------
@@ -84,7 +83,7 @@ def _by_number(file: Path) -> tuple[list[tuple[int, str]], str]:
 
 
 def _times(path: Path, frames: int) -> Floats | None:
-    """Seconds since the first frame, from the last column of ``times.csv``; None when there is no such file."""
+    """Return the seconds since the first frame, from the last column of ``times.csv``; None when there is no such file."""
     table = path / _TABLE
     if not table.is_file():
         return None

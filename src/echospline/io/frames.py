@@ -1,4 +1,4 @@
-"""A cine as a folder of numbered PNG files beside ``times.csv``."""
+"""A cine as a folder of numbered PNG files with ``times.csv``."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
-from echospline.image import Pixels
 from echospline.io.tag import spacing_tag
+from echospline.scene import Pixels, RegularGrid
 
 _OURS = re.compile(r"frame_\d{5,}\.png|times\.csv|\.unfinished\.png")
 

@@ -1,4 +1,4 @@
-"""Animated GIF, frame by frame: grey levels exact, delays true to the frames' times."""
+"""Animated GIF, frame by frame: with exact grey levels and delays that follow the frames' times."""
 
 from __future__ import annotations
 
@@ -10,20 +10,19 @@ import av
 import numpy as np
 from PIL import Image
 
-from echospline.grid import RegularGrid
-from echospline.image import Pixels
+from echospline.scene import Pixels, RegularGrid
 
 TICK = 100
 """GIF counts delays in hundredths of a second."""
 SHORTEST = 2
-"""Hundredths of a second; browsers show shorter delays as ten, so frames that come sooner are left out."""
+"""Hundredths of a second; browsers show shorter delays as ten, so frames at shorter intervals are left out."""
 
 
 class GifEncoder:
-    """GIF through FFmpeg's encoder, which streams (Pillow's gathers all frames first).
+    """GIF through FFmpeg's encoder, which streams (Pillow's collects all frames first).
 
-    Grey frames use the palette of all 256 greys and come back exactly; RGB frames get the 256 colours that fit
-    each best. Frames less than 0.02 s after the one before are left out, so the speed stays true above 50 per second.
+    Grey frames use the palette of all 256 greys and are exact when read again; RGB frames get the 256 colours that fit
+    each best. Frames less than 0.02 s after the one before are left out, so that the speed is right above 50 per second.
 
     Parameters
     ----------
@@ -34,7 +33,7 @@ class GifEncoder:
     colour : bool
         Whether frames are RGB.
     fps : float
-        Nominal frames per second, which sets how long the last frame lasts.
+        Nominal frames per second, which sets the duration of the last frame.
     """
 
     def __init__(self, part: Path, grid: RegularGrid, colour: bool, fps: float) -> None:
@@ -56,7 +55,7 @@ class GifEncoder:
         self._ticks = -SHORTEST
 
     def add(self, pixels: Pixels, time: float) -> None:
-        """Encode one frame, unless it comes too soon after the one before."""
+        """Encode one frame, unless it is too close in time to the one before."""
         if self._start is None:
             self._start = time
         ticks = round((time - self._start) * TICK)
@@ -83,7 +82,7 @@ class GifEncoder:
 
 
 def _indexed(pixels: Pixels) -> av.VideoFrame:
-    """RGB as indices into the 256 colours that fit this frame best."""
+    """Convert RGB to indices into the 256 colours that fit this frame best."""
     image = Image.fromarray(pixels).quantize(256, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
     colours = np.array(image.getpalette("RGB"), dtype=np.uint8).reshape(-1, 3)
     palette = np.zeros((256, 4), dtype=np.uint8)

@@ -1,4 +1,4 @@
-"""What kind of file it is, by its first bytes; a name's suffix is only a hint to people."""
+"""The kind of a file, by its first bytes; the suffix of its name is not used."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from echospline.errors import InputError
 Kind = Literal["picture", "gif", "dicom", "metaimage", "nrrd", "nifti", "video", "displacement", "toml"]
 
 HEAD = 4096
-"""Bytes looked at; every signature below lies within them."""
+"""Bytes read; every signature below lies within them."""
 
 _PICTURES = {
     b"\x89PNG\r\n\x1a\n": "PNG",
@@ -44,7 +44,7 @@ READABLE = "PNG, JPEG, TIFF, GIF, DICOM, MHA/MHD, NRRD, NIfTI, MP4, AVI, MOV, MK
 
 
 def head(path: Path) -> bytes:
-    """First bytes of a file, after the checks that every file must pass.
+    """Return the first bytes of a file after the checks that every file must pass.
 
     Raises
     ------
@@ -71,14 +71,14 @@ def head(path: Path) -> bytes:
 
 
 def kind_of(path: Path) -> tuple[Kind, str]:
-    """Tell a file's kind and format from its content.
+    """Identify a file's kind and format by its content.
 
     Returns
     -------
     kind : str
-        Which reader takes it.
+        The reader for it.
     format : str
-        The format's usual name, for people.
+        The format's usual name, for display.
 
     Raises
     ------
@@ -133,7 +133,7 @@ def _video(start: bytes) -> str | None:
 
 
 def _is_metaimage(start: bytes) -> bool:
-    """A MetaImage header is lines ``Key = value``; NDims and DimSize come early in every one."""
+    """Test for a MetaImage header: lines ``Key = value`` with NDims and DimSize among the first."""
     return re.search(rb"^\s*NDims\s*=", start, re.MULTILINE) is not None and b"\x00" not in start[:40]
 
 

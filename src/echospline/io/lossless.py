@@ -1,7 +1,7 @@
 """Lossless JPEG and JPEG-LS frames of DICOM files, decoded by GDCM in a process of their own.
 
-GDCM ends the whole process on some damaged frames (assertions, invalid memory), so it never runs in this one: the child
-writes frames as plain bytes to its standard output, and a child that dies is one damaged file.
+GDCM ends the whole process on some damaged frames (assertions, invalid memory), so it never runs in this one: a child
+process writes frames as plain bytes to its standard output, and its abnormal end counts as a damaged file.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from echospline.errors import InputError, MissingExtraError
-from echospline.image import Pixels
+from echospline.scene import Pixels
 
 
 def lossless_frames(

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
-from echospline.image import Pixels
+from echospline.scene import Pixels, RegularGrid
 
 _TYPES = {
     "int8": "MET_CHAR", "uint8": "MET_UCHAR", "int16": "MET_SHORT", "uint16": "MET_USHORT",
@@ -18,9 +17,9 @@ _TYPES = {
 
 
 class MetaImageEncoder:
-    """Streams raw frames behind a header whose frame count is kept true, so that a partial file can be read.
+    """Streams raw frames after a header whose frame count is always right, so that a partial file can be read.
 
-    Finishing writes the header anew with every frame's time stamp and copies the pixels behind it.
+    Finishing writes a new header with every frame's time stamp and copies the pixels after it.
 
     Parameters
     ----------
@@ -72,7 +71,7 @@ class MetaImageEncoder:
         return whole
 
     def abandon(self) -> None:
-        """Close; the header counts the frames that are there."""
+        """Close; the header counts the frames written."""
         self._file.close()
 
     def _header(self, *, stamps: bool) -> bytes:

@@ -11,9 +11,8 @@ import numpy as np
 from av.video.reformatter import ColorRange, Colorspace
 
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
-from echospline.image import Pixels
 from echospline.io.tag import spacing_tag
+from echospline.scene import Pixels, RegularGrid
 
 CLOCK = 90_000
 """Ticks per second: the usual clock of video, finer than any frame rate."""
@@ -23,10 +22,10 @@ _LIMITED = np.rint(16 + np.arange(256) * (219 / 255)).astype(np.uint8)
 
 
 class Mp4Encoder:
-    """H.264 frames into a fragmented MP4, so that what is on the disk can be played at any moment.
+    """H.264 frames into a fragmented MP4, so that the file can be played at any moment.
 
     Finishing copies the packets into a plain MP4 with its index in front (no second encoding), so that a browser
-    knows the duration and starts at once.
+    reads the duration and starts at once.
 
     Parameters
     ----------
@@ -59,7 +58,7 @@ class Mp4Encoder:
         stream.pix_fmt = "yuv420p"
         stream.codec_context.time_base = Fraction(1, CLOCK)
         stream.codec_context.gop_size = max(1, round(min(fps, 60)))
-        # Without B-frames the first frame is shown at 0 s in every player, and a partial file is short by little.
+        # Without B-frames the first frame is shown at 0 s in every player, and a partial file lacks only a little.
         stream.codec_context.max_b_frames = 0
         stream.codec_context.color_range = ColorRange.MPEG
         stream.codec_context.colorspace = Colorspace.ITU709

@@ -1,4 +1,4 @@
-"""A needle's path on disk: CSV rows of time, entry and tip, or the needle inside of a ``displacement.npz``."""
+"""A needle's path on disk: CSV rows of time, entry and tip, or the needle in a ``displacement.npz``."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from echospline.errors import InputError
 from echospline.io.displacement import read_displacement
 from echospline.io.kind import head
-from echospline.needle import Insertion
+from echospline.scene import Insertion
 
 COLUMNS = ("time_s", "entry_x_mm", "entry_y_mm", "tip_x_mm", "tip_y_mm")
 LARGEST = 50_000_000
@@ -29,7 +29,7 @@ def read_needle(path: str | Path) -> Insertion:
     Raises
     ------
     InputError
-        If the file is neither, or its numbers make no path.
+        If the file is neither, or its numbers are not a path.
     """
     path = Path(path)
     if head(path).startswith(b"PK"):

@@ -1,4 +1,4 @@
-"""Read an ultrasound image or cine from a file of any kind that the field uses."""
+"""Read an ultrasound image or cine from a file of any supported format."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from echospline.data import SAMPLES, sample_image
 from echospline.errors import InputError
-from echospline.grid import Floats, RegularGrid
-from echospline.image import Cine, Pixels, UltrasoundImage
 from echospline.io.kind import READABLE, kind_of
 from echospline.io.recording import LIMIT, MIB, Box, Recording, check_size, to_grey
+from echospline.io.samples import SAMPLES, sample_image
+from echospline.scene import Cine, Floats, Pixels, RegularGrid, UltrasoundImage
 
 SAMPLE = "sample:"
 
@@ -30,7 +29,7 @@ class CineStream:
     frames : int
         Number of frames.
     source : str
-        File, format and what the reader had to work out.
+        File, format and the reader's notes.
     """
 
     grid: RegularGrid
@@ -71,17 +70,17 @@ def read(
     Parameters
     ----------
     path : str or Path
-        PNG, JPEG, TIFF, BMP, GIF, DICOM, MHA/MHD, NRRD, NIfTI, MP4, AVI, MOV, MKV or WebM, told by content;
+        PNG, JPEG, TIFF, BMP, GIF, DICOM, MHA/MHD, NRRD, NIfTI, MP4, AVI, MOV, MKV or WebM, identified by content;
         a folder of numbered pictures; or ``"sample:calf"``, the image that ships with the package.
     spacing : (lateral, depth), optional
-        mm per pixel; needed where the file does not say, and preferred to what it says.
+        mm per pixel; needed where the file has none, and preferred to the file's.
     frame : int, optional
-        Take this frame alone, counted from 0 (-1 is the last), as an image.
+        Read this frame alone, counted from 0 (-1 is the last), as an image.
     region : (left, top, right, bottom), optional
         Pixels of the file to keep, right and bottom just outside; by default a DICOM file's own
         2-D tissue region, else everything.
     fps : float, optional
-        Frames per second; needed where a file of several frames does not say, and preferred to what it says.
+        Frames per second; needed where a file of several frames has none, and preferred to the file's.
     colour : bool
         Keep RGB; by default colour becomes grey (luma of ITU-R BT.601).
     limit : float
@@ -120,7 +119,7 @@ def read_image(
     colour: bool = False,
     limit: float = LIMIT,
 ) -> UltrasoundImage:
-    """Read one image, of a cine the first unless ``frame`` says another; parameters as for `read`."""
+    """Read one image, of a cine the first unless ``frame`` gives another; parameters as for `read`."""
     found = read(path, spacing=spacing, frame=frame, region=region, colour=colour, limit=limit)
     if isinstance(found, Cine):
         raise InputError(f"{path} holds a cine; expected an image: give a frame number")
@@ -175,10 +174,10 @@ def open_recording(path: str | Path, limit: float = LIMIT, *, whole: bool = True
 
         return open_folder(path, limit, whole=whole)
     kind, name = kind_of(path)
-    # The readers' libraries are large: each is imported when a file of its kind comes.
+    # The readers' libraries are large: each is imported when a file of its kind is opened.
     header_limit = limit if whole else float("inf")
     if kind in ("picture", "gif"):
-        from echospline.io.picture import open_picture  # noqa: PLC0415
+        from echospline.io.still import open_picture  # noqa: PLC0415
 
         recording = open_picture(path, name, header_limit)
     elif kind == "dicom":
@@ -289,7 +288,7 @@ def _cropped(path: Path, pixels: Pixels, box: Box, colour: bool) -> Pixels:
 
 
 def _gather(recording: Recording, box: Box, colour: bool, limit: float) -> Pixels:
-    """Decode all frames into one array; a file that holds other than it declares is refused."""
+    """Decode all frames into one array; a file that differs from its header is refused."""
     frames: Pixels | None = None
     count = 0
     for pixels in recording.decode(None, colour):

@@ -12,18 +12,17 @@ from typing import Any
 import numpy as np
 
 from echospline.errors import EchosplineError, InputError
-from echospline.grid import Floats
-from echospline.image import Pixels
+from echospline.scene import Floats, Pixels
 
 Box = tuple[int, int, int, int]
 """(left, top, right, bottom) in pixels of the file; right and bottom lie just outside."""
 
 LIMIT = 2048.0
-"""MiB of decoded pixels that a reader takes unless told otherwise."""
+"""Default limit of a reader, MiB of decoded pixels."""
 
 MIB = 2**20
 _ITK_PREFIX = re.compile(r"(?s)^.*itk::?ERROR: \w+\(0x[0-9a-f]+\): |^.*ITK ERROR: \w+\(0x[0-9a-f]+\): ")
-"""Source lines and addresses that ITK puts before what it has to say."""
+"""Source lines and addresses that ITK puts before its message."""
 LUMA = np.array([0.299, 0.587, 0.114])
 """Weights of red, green and blue in grey: ITU-R BT.601, the matrix of DICOM's YBR_FULL too."""
 
@@ -39,7 +38,7 @@ class Region:
     spacing : (lateral, depth) or None
         mm per pixel; None where the region has no lengths (a spectrum, an M-mode trace).
     content : str
-        What it shows, e.g. "2-D tissue".
+        Its content, e.g. "2-D tissue".
     """
 
     box: Box
@@ -49,14 +48,14 @@ class Region:
 
 @dataclass(frozen=True)
 class Recording:
-    """What a file declares, and how to get at its pixels.
+    """The declared properties of a file, and access to its pixels.
 
     Parameters
     ----------
     path : Path
         The file.
     format : str
-        Name of the format, for people.
+        Name of the format, for display.
     rows, columns : int
         Size of one frame.
     frames : int
@@ -69,17 +68,17 @@ class Recording:
         ``decode(None, colour)`` yields every frame, ``decode(i, colour)`` frame i alone, each
         (rows, columns) or (rows, columns, 3); without ``colour`` a decoder may give grey where that is quicker.
     spacing : (lateral, depth), optional
-        mm per pixel, where the file says so.
+        mm per pixel, where the file has it.
     region : Box, optional
-        Where the tissue is; the whole frame when None.
+        The part that shows tissue; the whole frame when None.
     regions : tuple of Region
         All regions the file describes.
     times : ndarray, shape (frames,), optional
-        Seconds since the first frame, where the file says so.
+        Seconds since the first frame, where the file has them.
     single : bool
         Whether the file is a still image (then one frame is read as an image, not as a cine).
     notes : tuple of str
-        What a reader had to work out or doubt, one sentence each.
+        Conclusions and doubts of the reader, one sentence each.
     """
 
     path: Path
@@ -129,7 +128,7 @@ def check_size(path: Path, rows: int, columns: int, frames: int, bytes_per_pixel
 
 
 def to_grey(pixels: Pixels) -> Pixels:
-    """Luma of an RGB frame in its own type, rounded; a grey frame as it is."""
+    """Return the luma of an RGB frame in its own type, rounded; a grey frame unchanged."""
     if pixels.ndim == 2:
         return pixels
     kind = np.float32 if pixels.dtype.itemsize == 1 else np.float64
@@ -139,10 +138,10 @@ def to_grey(pixels: Pixels) -> Pixels:
 
 @contextmanager
 def decoding(path: Path, what: str) -> Iterator[None]:
-    """Turn whatever a decoder raises on a damaged file into one sentence.
+    """Turn any error of a decoder on a damaged file into one sentence.
 
-    Decoders meet damaged bytes with struct.error, KeyError, EOFError, SyntaxError and a dozen kinds of
-    their own, so every Exception is taken; echospline's own errors pass.
+    Decoders raise struct.error, KeyError, EOFError, SyntaxError and a dozen exceptions of
+    their own on damaged bytes, so every Exception is caught; echospline's own errors pass.
     """
     try:
         yield
@@ -160,7 +159,7 @@ def decoding(path: Path, what: str) -> Iterator[None]:
 
 
 def quietly(frames: Iterator[Pixels], quiet: Callable[[], AbstractContextManager[None]]) -> Iterator[Pixels]:
-    """Decode each frame inside of ``quiet`` and hand it out outside, where warnings are others' business."""
+    """Decode each frame inside ``quiet`` and yield it outside, where the caller's warnings apply."""
     while True:
         with quiet():
             pixels = next(frames, None)

@@ -1,11 +1,11 @@
-"""Spacing as a line of text, for formats that have no place for it: written and read by echospline alone."""
+"""Spacing as a line of text, for formats without a field for it: written and read by echospline alone."""
 
 from __future__ import annotations
 
 import re
 from math import isfinite
 
-from echospline.grid import RegularGrid
+from echospline.scene import RegularGrid
 
 _LINE = re.compile(r"echospline: pixels of ([0-9.e+-]{1,32}) mm lateral, ([0-9.e+-]{1,32}) mm depth")
 

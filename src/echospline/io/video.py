@@ -10,21 +10,20 @@ import av
 import numpy as np
 
 from echospline.errors import InputError
-from echospline.grid import Floats
-from echospline.image import Pixels
 from echospline.io.recording import Recording, check_size, decoding
 from echospline.io.tag import tagged_spacing
+from echospline.scene import Floats, Pixels
 
 _DEMUXERS = {"MP4": "mov", "QuickTime": "mov", "AVI": "avi", "Matroska": "matroska", "WebM": "matroska"}
 """The one demuxer tried for each format: others of FFmpeg's follow references to other files."""
 _LENIENT: dict[str, Any] = {"metadata_errors": "replace"} if int(av.__version__.split(".")[0]) < 19 else {}
 """Before PyAV 19 a comment in another encoding would make the whole file unreadable."""
 _SMALLEST_GUARD = 2**22
-"""Pixels a decoder may always use: some begin with a size of their own and take the stream's afterwards."""
+"""Pixels a decoder may always use: some start with a default size and change to the stream's afterwards."""
 
 
 def open_video(path: Path, format: str, limit: float) -> Recording:
-    """Open a video. Its packets are counted and timed once, none is decoded.
+    """Open a video. Its packets are counted and timed once; none is decoded.
 
     Parameters
     ----------
@@ -86,7 +85,7 @@ def _opened(path: Path, format: str) -> Any:
 
 
 def _timed(container: Any, stream: Any) -> tuple[Floats | None, int]:
-    """Times of the frames in s since the first, from their packets, and how many packets are shown."""
+    """Return the times of the frames in s since the first, from their packets, and how many packets are shown."""
     stamps: list[float | None] = [
         None if packet.pts is None else float(packet.pts * packet.time_base)
         for packet in container.demux(stream)

@@ -1,7 +1,7 @@
 """MetaImage, NRRD and NIfTI through SimpleITK: a 2-D image, or a cine along the third axis.
 
-ITK guards itself unevenly (a NIfTI file cut in half is read as if it were whole, a header may name any file of the
-machine as its pixels), so the header is read here as well and checked before ITK sees it.
+ITK's checks are incomplete (a NIfTI file cut in half is read as if it were whole, a header may name any file of the
+machine as its pixels), so the header is read here as well and checked before ITK reads the file.
 """
 
 from __future__ import annotations
@@ -18,10 +18,9 @@ import numpy as np
 import SimpleITK
 
 from echospline.errors import InputError
-from echospline.grid import Floats
-from echospline.image import Pixels
 from echospline.io.kind import Kind
 from echospline.io.recording import Recording, check_size, decoding
+from echospline.scene import Floats, Pixels
 
 _ITK: Any = SimpleITK
 """SimpleITK, whose functions carry no types."""
@@ -61,13 +60,13 @@ def open_volume(path: Path, kind: Kind, format: str, limit: float, *, whole: boo
     path : Path
         The file.
     kind : {"metaimage", "nrrd", "nifti"}
-        Which reader.
+        The reader.
     format : str
-        Name for people.
+        Name for display.
     limit : float
         MiB of decoded pixels, of all frames or of one.
     whole : bool
-        Whether all frames are wanted. A compressed volume always counts as a whole.
+        Whether all frames are needed. A compressed volume always counts as a whole.
 
     Raises
     ------
@@ -155,7 +154,7 @@ def _turned(pixels: Pixels, orientation: tuple[bool, bool, bool]) -> Pixels:
 
 
 def _orientation(letters: str) -> tuple[tuple[bool, bool, bool], list[str]]:
-    """(depth axis first, lateral flipped, depth flipped) from PLUS's letters M/U (marked side) and F/N (far, near)."""
+    """Return (depth axis first, lateral flipped, depth flipped) from PLUS's letters M/U (marked side) and F/N (far, near)."""
     found = re.match(r"\s*([MU][FN]|[FN][MU])", letters)
     if not found:
         return (False, False, False), []
@@ -165,7 +164,7 @@ def _orientation(letters: str) -> tuple[tuple[bool, bool, bool], list[str]]:
 
 
 def _fields(path: Path, kind: Kind) -> dict[str, str]:
-    """Header as written, keys in lower case, and what was found out: ``_packed``, ``_held`` or ``_offset`` (bytes)."""
+    """Return the header as written, keys in lower case, with its findings ``_packed``, ``_held`` or ``_offset`` (bytes)."""
     if kind == "nifti":
         return _nifti_fields(path)
     text, end, terminated = _header_text(path, kind)
@@ -189,7 +188,7 @@ def _fields(path: Path, kind: Kind) -> dict[str, str]:
             raise InputError(f"{path} ends before its pixels: its header is cut short")
         fields["_packed"] = "" if fields.get("encoding", "raw").lower() in _RAW else "yes"
         raw = not fields["_packed"]
-    # Offsets and skips are ITK's business; where they are given, only ITK checks the length.
+    # ITK handles offsets and skips; where they are given, only ITK checks the length.
     plain = not any(
         fields.get(key, "0") not in ("0", "-1") for key in ("headersize", "byte skip", "line skip")
     )
@@ -202,7 +201,7 @@ def _fields(path: Path, kind: Kind) -> dict[str, str]:
 
 
 def _header_text(path: Path, kind: Kind) -> tuple[str, int, bool]:
-    """Text header, the offset behind it, and whether it ended as it must."""
+    """Return the text header, the offset of its end, and whether it is complete."""
     with path.open("rb") as file:
         lines: list[str] = []
         while line := file.readline(_HEADER_BYTES):
@@ -217,7 +216,7 @@ def _header_text(path: Path, kind: Kind) -> tuple[str, int, bool]:
 
 
 def _check_neighbour(path: Path, name: str) -> None:
-    """Refuse a header that names pixels elsewhere: only a plain file beside it is taken."""
+    """Refuse a header that names pixels elsewhere: only a plain file in its own folder is accepted."""
     if Path(name).name != name or re.search(r"[%*\s]|^LIST", name) or not (path.parent / name).is_file():
         raise InputError(
             f"{path} keeps its pixels in {name!r}; expected a file of that name beside it, in the same folder"
@@ -225,7 +224,7 @@ def _check_neighbour(path: Path, name: str) -> None:
 
 
 def _nifti_fields(path: Path) -> dict[str, str]:
-    """Byte counts of a NIfTI file: ITK reads a file that is cut short without a word."""
+    """Return the byte counts of a NIfTI file: ITK reads a truncated file without an error."""
     if not path.name.lower().endswith(_NIFTI_NAMES):
         raise InputError(f"{path} is NIfTI by its content; its name must end with .nii or .nii.gz: rename it")
     with path.open("rb") as file:
@@ -263,7 +262,7 @@ def _check_bytes(path: Path, fields: dict[str, str], expected: int) -> None:
 
 
 def _length(path: Path, enough: int, packed: bool) -> int:
-    """Bytes in a file, inflated if need be, counted up to ``enough``."""
+    """Count the bytes in a file, inflated if compressed, up to ``enough``."""
     if not packed:
         return path.stat().st_size
     count = 0
@@ -276,7 +275,7 @@ def _length(path: Path, enough: int, packed: bool) -> int:
 def _spacing(
     path: Path, kind: Kind, fields: dict[str, str], found: tuple[float, ...]
 ) -> tuple[tuple[float, float] | None, list[str]]:
-    """(first, second axis) in mm, and what to doubt about it."""
+    """Return (first, second axis) in mm, and notes on doubtful values."""
     keys = {
         "metaimage": ("elementspacing", "elementsize"),
         "nrrd": ("spacings", "space directions"),
@@ -292,7 +291,7 @@ def _spacing(
             f"{path} gives its lengths in {unit[0]!r}; expected {', '.join(_TO_MM)}: give --spacing LAT,DEPTH"
         )
     scale = _TO_MM[unit[0]] if unit and unit[0] else 1.0
-    # NIfTI stores 32-bit lengths: 0.1 comes as 0.10000000149 and is meant as 0.1.
+    # NIfTI stores 32-bit lengths: 0.1 is stored as 0.10000000149 and means 0.1.
     first, second = (float(str(np.float32(h))) if kind == "nifti" else float(h) * scale for h in found[:2])
     if not (isfinite(first) and isfinite(second) and min(first, second) > 0):
         return None, [f"its spacing {found[:2]} is no length"]
@@ -301,7 +300,7 @@ def _spacing(
 
 
 def _times(tags: dict[str, str], fields: dict[str, str], frames: int) -> Floats | None:
-    """Seconds since the first frame: PLUS's time stamps, or 3D Slicer's index of a sequence."""
+    """Return the seconds since the first frame: PLUS's time stamps, or 3D Slicer's index of a sequence."""
     stamps = [tags.get(f"Seq_Frame{i:04d}_Timestamp") for i in range(frames)]
     if all(stamp is None for stamp in stamps):
         index = next(

@@ -1,4 +1,4 @@
-"""Write a cine frame by frame; only a finished file ever carries its final name."""
+"""Write a cine frame by frame; only a complete file has its final name."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ from typing import Protocol, Self
 
 import numpy as np
 
+from echospline.atomic import give_name, part_of, writing
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
-from echospline.image import Pixels
-from echospline.io.part import give_name, part_of, writing
+from echospline.scene import Pixels, RegularGrid
 
 FORMATS = (".mp4", ".gif", ".mha")
 
@@ -28,15 +27,15 @@ class Encoder(Protocol):
         """Complete the file and return its (still temporary) path."""
 
     def abandon(self) -> None:
-        """Close what is open and leave the partial file where it is."""
+        """Close open files and keep the partial file."""
 
 
 class CineWriter:
-    """Writes frames one by one to one file or folder; holds none of them.
+    """Writes frames one by one to one file or folder and keeps none in memory.
 
-    While it writes, the file is called ``NAME.part``. `close` completes it and gives it its name in one
-    step. If the ``with`` block ends with an exception, or the process dies, ``NAME.part`` stays behind with
-    the frames so far, readable, and whatever was called NAME before is untouched.
+    Until `close`, the file is called ``NAME.part``; `close` completes it and renames it in one
+    step. If the ``with`` block ends with an exception, or the process dies, ``NAME.part`` remains with
+    the frames so far, readable, and an earlier file NAME is unchanged.
 
     Parameters
     ----------
@@ -168,11 +167,11 @@ def open_writer(
     ----------
     path : str or Path
         ``.mp4`` (H.264, plays in browsers), ``.gif``, ``.mha`` (sequence for ITK, 3D Slicer, PLUS), or a name
-        without suffix: a folder of numbered PNG files beside ``times.csv``.
+        without suffix: a folder of numbered PNG files with ``times.csv``.
     grid : RegularGrid
         Pixel centres of every frame, mm.
     fps : float
-        Nominal frames per second; each frame's own time rules, this is only how long the last one lasts.
+        Nominal frames per second; each frame's own time decides; this sets only the duration of the last one.
     window : (low, high), optional
         Pixel values shown as black and white. Needed for pixels other than 8-bit in MP4 and GIF (8 and 16-bit
         in PNG); values outside are shown as black or white.

@@ -18,10 +18,10 @@ from numpy.typing import ArrayLike
 from scipy.linalg import lu_factor, lu_solve
 
 from echospline.errors import InputError
-from echospline.grid import Floats, as_points
 from echospline.mechanics.compiled import add_product
 from echospline.mechanics.kernels import Elastic, Kernel
 from echospline.mechanics.spline import Spline, compliance
+from echospline.scene import Floats, as_points
 
 
 @dataclass(frozen=True)

@@ -205,7 +205,7 @@ def forget_stale_code() -> None:
             return
         _ready.add("cache")
         folder = Path(__file__).parent
-        sources = [*folder.glob("*.py"), folder.parent / "needle.py"]
+        sources = [*folder.glob("*.py"), folder.parent / "scene" / "needle.py"]
         changed = max(source.stat().st_mtime for source in sources)
         for index in (folder / "__pycache__").glob("*.nbi"):
             with suppress(OSError):  # where this may not be written, numba keeps nothing here either

@@ -18,7 +18,7 @@ from echospline.mechanics.mesh_field import combine, contacts_field, leaving, sp
 from echospline.mechanics.tip_column import conditioned, meet, patch_at
 from echospline.mechanics.tip_patch import AHEAD, HALF_WIDTH, LASTS
 from echospline.mechanics.touch import clearance, follow, load, needle, touch
-from echospline.needle import ZERO_LENGTH
+from echospline.scene import ZERO_LENGTH
 
 CONTACTS, BEYOND, RELEASED, DONE = 0, 1, 2, 3
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from echospline.grid import Floats, RegularGrid
 from echospline.mechanics.finite_elements import (
     Integration,
     Method,
@@ -24,8 +23,7 @@ from echospline.mechanics.finite_elements import (
 )
 from echospline.mechanics.forces import NeedleForces, check_step, travelled
 from echospline.mechanics.landmarks import Clamps
-from echospline.needle import ZERO_LENGTH, NeedlePose
-from echospline.tissue import Tissue
+from echospline.scene import ZERO_LENGTH, Floats, NeedlePose, RegularGrid, Tissue
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from scipy.sparse.linalg import splu
 from skfem import Basis, BilinearForm, ElementQuad1, ElementVector, MeshQuad
 
 from echospline.errors import InputError, SolverError
-from echospline.grid import Floats, RegularGrid, as_points
+from echospline.scene import Floats, RegularGrid, as_points
 
 Plane = Literal["stress", "strain"]
 Integration = Literal["full", "selective"]

@@ -8,8 +8,7 @@ from math import exp, isfinite
 import numpy as np
 
 from echospline.errors import InputError
-from echospline.grid import Floats
-from echospline.needle import NeedlePose
+from echospline.scene import Floats, NeedlePose
 
 
 @dataclass(frozen=True)

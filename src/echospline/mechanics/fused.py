@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from echospline.grid import Floats, RegularGrid
 from echospline.mechanics.anchored_kernel import AnchoredKernel
 from echospline.mechanics.compiled import compile_ahead
 from echospline.mechanics.compiled_step import (
@@ -33,7 +32,7 @@ from echospline.mechanics.response import NO_TIP, Precision, Response
 from echospline.mechanics.spline import Spline
 from echospline.mechanics.tip_patch import PARTS
 from echospline.mechanics.touch import needle
-from echospline.needle import NeedlePose
+from echospline.scene import Floats, NeedlePose, RegularGrid
 
 PLAIN = np.empty(0)
 

@@ -15,12 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from echospline.errors import InputError
-from echospline.grid import Floats, RegularGrid
 from echospline.mechanics.forces import NeedleForces, check_step, travelled
 from echospline.mechanics.half_plane import GreensFunction
 from echospline.mechanics.landmarks import Clamps
-from echospline.needle import ZERO_LENGTH, NeedlePose
-from echospline.tissue import Tissue
+from echospline.scene import ZERO_LENGTH, Floats, NeedlePose, RegularGrid, Tissue
 
 
 @dataclass(frozen=True)

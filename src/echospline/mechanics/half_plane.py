@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import lu_factor, lu_solve
 
 from echospline.errors import InputError
-from echospline.grid import Floats, as_points
+from echospline.scene import Floats, as_points
 
 
 def fundamental(

@@ -10,8 +10,7 @@ from math import exp, inf
 
 import numpy as np
 
-from echospline.grid import Floats
-from echospline.needle import NeedlePose
+from echospline.scene import Floats, NeedlePose
 
 LET_GO = 1e-4
 """mm; a landmark that has left the needle is dropped once it is this close to the field without it."""
@@ -59,7 +58,7 @@ def relax(q: Floats, target: Floats, alpha3: float, dt: float) -> Floats:
     return relaxed
 
 
-def follow(q: Floats, target: Floats, travel: float) -> Floats:
+def approach(q: Floats, target: Floats, travel: float) -> Floats:
     """Move displacements (k, 2) towards their targets, none further than ``travel`` (mm)."""
     gap = target - q
     distance = np.hypot(gap[:, 0], gap[:, 1])
@@ -101,7 +100,7 @@ def load(q: Floats, f: Floats, side: Floats, axis: Floats, alpha3: float, dt: fl
     relaxed = np.where(loading, along, relax(along, f, alpha3, dt))
     rested = q + (relaxed - along)[:, None] * axis
     target = np.where(loading, f, relaxed)[:, None] * axis + side
-    return follow(rested, target, travel)
+    return approach(rested, target, travel)
 
 
 def tip_push(pose: NeedlePose, sigma: float, clearance: float) -> float:

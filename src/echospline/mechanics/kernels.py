@@ -12,7 +12,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from echospline.errors import InputError
-from echospline.grid import Floats
+from echospline.scene import Floats
 
 
 class Kernel(Protocol):

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from echospline.grid import Floats, RegularGrid
 from echospline.mechanics.anchored_kernel import AnchoredKernel
 from echospline.mechanics.kernels import Kernel
-from echospline.tissue import Tissue
+from echospline.scene import Floats, RegularGrid, Tissue
 
 
 def landmark_stiffness(tissue: Tissue, grid: RegularGrid, kernel: Kernel, anchors: Floats) -> Floats:

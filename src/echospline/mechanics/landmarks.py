@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from echospline.errors import InputError
-from echospline.grid import EDGES, Floats, RegularGrid, as_points
+from echospline.scene import EDGES, Floats, RegularGrid, as_points
 
 
 @dataclass(frozen=True)

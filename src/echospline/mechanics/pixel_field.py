@@ -14,10 +14,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from echospline.grid import Floats, RegularGrid
 from echospline.mechanics.anchored_kernel import AnchoredKernel
 from echospline.mechanics.compiled import OPTIONS, compile_ahead, kernel
 from echospline.mechanics.response import Response
+from echospline.scene import Floats, RegularGrid
 
 FINE = 20_000
 """Nodes above which a mesh is evaluated from a coarse one."""

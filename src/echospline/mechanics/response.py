@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from echospline.errors import SolverError
-from echospline.grid import Floats
 from echospline.mechanics.anchored_kernel import AnchoredKernel
 from echospline.mechanics.basis import Basis, new_basis
 from echospline.mechanics.compiled import CHUNK
@@ -25,6 +24,7 @@ from echospline.mechanics.row_sums import BLOCK
 from echospline.mechanics.spline import Spline
 from echospline.mechanics.tip_column import meet_exactly, tend
 from echospline.mechanics.tip_patch import COEFFICIENTS, DEGREE, NODES
+from echospline.scene import Floats
 
 RESIDUAL = 1e-6
 """mm; misfit at the landmarks, for displacements of 1 mm, at which the response is rebuilt."""

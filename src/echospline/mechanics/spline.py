@@ -16,8 +16,8 @@ from scipy.linalg import lu_factor, lu_solve
 from scipy.spatial import cKDTree
 
 from echospline.errors import InputError, SolverError
-from echospline.grid import Floats, as_points
 from echospline.mechanics.kernels import Kernel
+from echospline.scene import Floats, as_points
 
 RESIDUAL = 1e-7
 """mm; largest misfit at the landmarks, relative to displacements of 1 mm, before a solution is refused."""

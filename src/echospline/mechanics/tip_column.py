@@ -12,13 +12,7 @@ import numpy as np
 from numba import njit
 
 from echospline.mechanics.compiled import CHUNK, OPTIONS, add_range, component, kernel, kernel_rows
-from echospline.mechanics.contacts import (
-    contacts_and_nodes,
-    keep,
-    smooth_part,
-    source_rows,
-    times_M,
-)
+from echospline.mechanics.contacts import contacts_and_nodes, keep, smooth_part, source_rows, times_M
 from echospline.mechanics.row_sums import BLOCK, sum_block
 from echospline.mechanics.tip_patch import AHEAD, DEGREE, HALF_WIDTH, NEAR, NODES, PARTS, SMALLEST
 

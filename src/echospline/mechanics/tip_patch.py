@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from echospline.grid import Floats
+from echospline.scene import Floats
 
 DEGREE = 3
 """Total degree of the interpolant: 10 points."""

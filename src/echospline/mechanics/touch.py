@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from echospline.mechanics.compiled import OPTIONS
-from echospline.needle import ZERO_LENGTH
+from echospline.scene import ZERO_LENGTH
 
 COLUMNS = ("source", "touching", "qx", "qy", "along", "grip x", "grip y")
 TIP = ("present", "x", "y", "qx", "qy", "pushed", "posed", "entry x", "entry y", "tip x", "tip y", "reach")

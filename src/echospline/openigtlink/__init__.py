@@ -1,1 +1,29 @@
-"""OpenIGTLink: a codec (bytes in, messages out), a link of many peers, and the scene between them and the plane."""
+"""OpenIGTLink: messages, link and session."""
+
+from echospline.openigtlink.link import PORT, Link, LinkLimits
+from echospline.openigtlink.message import Message
+from echospline.openigtlink.outgoing import Looks
+from echospline.openigtlink.plus import read_calibration
+from echospline.openigtlink.pose import Position, Transform
+from echospline.openigtlink.session import Session
+from echospline.openigtlink.stage import Rates, SessionOptions, Stage
+from echospline.openigtlink.text import Status, String
+from echospline.openigtlink.transforms import Naming
+
+__all__ = [
+    "PORT",
+    "Link",
+    "LinkLimits",
+    "Looks",
+    "Message",
+    "Naming",
+    "Position",
+    "Rates",
+    "Session",
+    "SessionOptions",
+    "Stage",
+    "Status",
+    "String",
+    "Transform",
+    "read_calibration",
+]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 POLYNOMIAL = 0x42F0E1EBA9EA3693
 WIDTH = 16
-"""Bytes that one step of the loop takes ("slicing by 16"); each needs a table of its own."""
+"""Bytes handled in one step of the loop ("slicing by 16"); each needs a table of its own."""
 
 Tables = NDArray[np.uint64]
 Loop = Callable[[NDArray[np.uint8], Tables], Any]
@@ -20,28 +20,28 @@ Loop = Callable[[NDArray[np.uint8], Tables], Any]
 def crc64(data: bytes | bytearray | memoryview) -> int:
     """Check sum of ``data``, 0 <= value < 2**64.
 
-    The first call in a process compiles (half a second, kept on disk afterwards); `warm_up` takes that
-    moment out of a running link.
+    The first call in a process compiles (half a second, kept on disk afterwards); `warm_up` moves that
+    time out of a running link.
     """
     loop, tables = _compiled()
     return int(loop(np.frombuffer(data, dtype=np.uint8), tables))
 
 
 def warm_up() -> None:
-    """Compile now."""
+    """Compile the loop now."""
     crc64(b"")
 
 
 @cache
 def _compiled() -> tuple[Loop, Tables]:
-    # numba takes half a second to import: only those who open a link pay for it.
+    # numba takes half a second to import: it is imported only when a link is opened.
     import numba  # noqa: PLC0415
 
     return numba.njit(_loop, nogil=True, cache=True), _tables()
 
 
 def _tables() -> Tables:
-    """Table k holds the check sum of each byte followed by k zero bytes, shape (WIDTH, 256)."""
+    """Build the tables, shape (WIDTH, 256): table k holds the check sum of each byte followed by k zero bytes."""
     first = []
     for byte in range(256):
         value = byte << 56

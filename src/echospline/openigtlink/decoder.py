@@ -1,4 +1,4 @@
-"""Bytes of one stream in, in pieces of any size; messages out."""
+"""Decoder of one stream: bytes in pieces of any size in, messages out."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ BOUND = 2**20
 
 
 class Decoder:
-    """Cuts a stream into messages.
+    """Splits a stream into messages.
 
-    The size that a header announces is checked before a byte of the body is waited for; memory grows with
-    what arrived, never with what was announced. After a `ProtocolError` the stream has lost its place and
+    The size that a header announces is checked before its body is read; memory grows with the
+    bytes received, never with the size announced. After a `ProtocolError` the position in the stream is lost and
     every further call raises again.
     """
 
@@ -31,18 +31,18 @@ class Decoder:
 
     @property
     def waiting_for(self) -> str:
-        """What the stream stopped in the middle of; empty between messages."""
+        """Description of the incomplete message; empty between messages."""
         if self._header is not None:
             return f"{self._header.type}: {len(self._buffer)} of {self._header.body_size} bytes"
         return f"a header: {len(self._buffer)} of {HEADER_SIZE} bytes" if self._buffer else ""
 
     def feed(self, data: bytes) -> list[Message]:
-        """Messages that ``data`` completes, in order.
+        """Return the messages that ``data`` completes, in order.
 
         Raises
         ------
         ProtocolError
-            If the stream is not OpenIGTLink; `complete` holds what came before the fault.
+            If the stream is not OpenIGTLink; `complete` holds the messages before the fault.
         """
         if self._broken is not None:
             raise self._broken

@@ -18,7 +18,7 @@ _FRACTION = 1 << 32
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """What announces a body.
+    """Header of a body.
 
     Parameters
     ----------
@@ -44,18 +44,18 @@ class Header:
     crc: int
 
     def pack(self) -> bytes:
-        """58 bytes, big-endian.
+        """Pack into 58 bytes, big-endian.
 
         Raises
         ------
         InputError
-            If a name is too long or not ASCII: it would arrive as another name.
+            If a name is too long or not ASCII: it would change on the way.
         """
         if not (math.isfinite(self.timestamp) and 0 <= self.timestamp < _FRACTION):
             raise InputError(
                 f"a time stamp is seconds since 1970 (0 to {_FRACTION - 1}); got {self.timestamp}"
             )
-        # 32 bits of seconds, 32 bits of fraction: split first, a float holds no 64 bits
+        # 32 bits of seconds, 32 bits of fraction: split first, because a float cannot hold 64 bits
         seconds = int(self.timestamp)
         fraction = min(round((self.timestamp - seconds) * _FRACTION), _FRACTION - 1)
         return _HEADER.pack(
@@ -69,12 +69,12 @@ class Header:
 
     @classmethod
     def unpack(cls, data: bytes | bytearray | memoryview) -> Header:
-        """Header of the first 58 bytes.
+        """Unpack the first 58 bytes.
 
         Raises
         ------
         ProtocolError
-            If they are no OpenIGTLink header.
+            If they are not an OpenIGTLink header.
         """
         version, kind, device, stamp, size, crc = _HEADER.unpack_from(data)
         if version not in VERSIONS:
@@ -84,14 +84,14 @@ class Header:
         message_type = unpack_name(kind, "message type")
         if not message_type or not message_type.replace("_", "").isalnum():
             raise ProtocolError(f"the stream is not OpenIGTLink: {message_type!r} is no message type")
-        # a device may be called anything, "µ-probe" in Latin-1 as well: no ground to lose the peer
+        # a device may be called anything, "µ-probe" in Latin-1 as well: no reason to close the connection
         name = device.split(b"\0", 1)[0].decode("utf-8", "replace")
         timestamp = (stamp >> 32) + (stamp & (_FRACTION - 1)) / _FRACTION
         return cls(version, message_type, name, timestamp, size, crc)
 
 
 def pack_name(text: str, size: int, what: str) -> bytes:
-    """ASCII bytes of a name that must fit ``size`` bytes (the packing pads with zeros).
+    """Encode a name as ASCII bytes that must fit ``size`` bytes (the packing pads with zeros).
 
     Raises
     ------
@@ -106,7 +106,7 @@ def pack_name(text: str, size: int, what: str) -> bytes:
 
 
 def unpack_name(field: bytes, what: str) -> str:
-    """Text of a zero-padded ASCII field.
+    """Decode the text of a zero-padded ASCII field.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""IMAGE: pixels beside the matrix that lays them in space; the protocol's position is the image *centre*."""
+"""IMAGE: pixels with the matrix that places them in space; the protocol's position is the image *centre*."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echospline.errors import InputError, ProtocolError
-from echospline.grid import Floats
 from echospline.openigtlink.ndarray import SCALARS, scalar_code
-from echospline.openigtlink.pose import as_transform
+from echospline.scene import Floats, as_transform
 
 _HEAD = struct.Struct(">HBBBB3H12f3H3H")
 _LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -55,7 +54,7 @@ class Image:
         return columns, rows, slices
 
     def pack(self) -> bytes:
-        """72 bytes of header and the voxels, little-endian, first axis (columns) fastest."""
+        """Pack 72 bytes of header and the voxels, little-endian, first axis (columns) fastest."""
         v = self.voxels
         code = scalar_code(v, "an IMAGE")
         if SCALARS[code] == "c16":
@@ -67,12 +66,12 @@ class Image:
 
     @classmethod
     def unpack(cls, content: memoryview) -> Image:
-        """Image of the bytes; LPS becomes RAS.
+        """Unpack an image; LPS becomes RAS.
 
         Raises
         ------
         ProtocolError
-            If the sizes do not fit the bytes, or the message brings a part of a volume only.
+            If the sizes do not fit the bytes, or the message holds only a part of a volume.
         """
         if len(content) < _HEAD.size:
             raise ProtocolError(f"an IMAGE has 72 bytes of header; got {len(content)} bytes")
@@ -104,5 +103,5 @@ class Image:
 
 
 def centre(size: tuple[int, int, int]) -> Floats:
-    """Homogeneous index (column, row, slice, 1) of the middle of an image of ``size`` voxels."""
+    """Return the homogeneous index (column, row, slice, 1) of the middle of an image of ``size`` voxels."""
     return np.array([(n - 1) / 2 for n in size] + [1.0])

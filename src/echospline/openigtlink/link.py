@@ -33,18 +33,18 @@ ABBREVIATED = {"CAPABIL": "CAPABILITY", "TRANS": "TRANSFORM"}
 
 @dataclass(frozen=True)
 class LinkLimits:
-    """How much the link takes upon itself."""
+    """Limits of a link."""
 
     peers: int = 32
     """Connections at a time; more are refused."""
     retry: float = 1.0
     """Seconds between attempts to connect, in client mode."""
     patience: Patience = field(default_factory=Patience)
-    """How long a peer may do nothing."""
+    """Time limits and buffer of a peer."""
 
 
 class Link:
-    """Peers that come and go, and what they and echospline last said.
+    """The connected peers and the newest message of each device, theirs and echospline's.
 
     All methods belong to the event loop's thread; from another use ``loop.call_soon_threadsafe``.
 
@@ -54,7 +54,7 @@ class Link:
         Called with (peer, message) for every message that is not answered by the link itself: it answers
         GET_STATUS, GET_CAPABILITY, other GET_ by the newest message of that type, STT_ and STP_.
     status : callable
-        What to answer to GET_STATUS.
+        Returns the answer to GET_STATUS.
     limits : LinkLimits
         Its limits.
     """
@@ -68,20 +68,20 @@ class Link:
         self._received, self._status = received, status
         self.limits = limits or LinkLimits()
         self.peers: list[Peer] = []
-        self.farewells: list[tuple[str, str]] = []
-        """Name and reason of the last hundred peers that left."""
+        self.departures: list[tuple[str, str]] = []
+        """Name and reason of the last hundred closed connections."""
         self._newest: dict[Key, Outgoing] = {}
         self._servers: list[asyncio.Server] = []
         self._tasks: list[asyncio.Task[None]] = []
         self._closing = False
 
     async def serve(self, host: str = "127.0.0.1", port: int = PORT) -> int:
-        """Listen; returns the port (the one that was free, for port 0).
+        """Listen for peers; returns the port (a free one for port 0).
 
         Raises
         ------
         InputError
-            If the address cannot be had.
+            If the address cannot be bound.
         """
         self._begin()
         loop = asyncio.get_running_loop()
@@ -104,16 +104,16 @@ class Link:
     def publish(self, message: Message) -> None:
         """Send to every peer; a peer that is still busy with an older one of its kind gets the newest.
 
-        A peer that sends this device itself is left out: it would get its own words back.
+        A peer that sends this device itself is left out: it would receive its own message.
         """
         outgoing = Outgoing(message)
         self._newest[outgoing.key] = outgoing
         for peer in list(self.peers):
-            if outgoing.key not in peer.speaks:
+            if outgoing.key not in peer.sends:
                 peer.offer(outgoing)
 
     async def close(self) -> None:
-        """Say goodbye to all."""
+        """Close all connections."""
         self._closing = True
         for task in self._tasks:
             task.cancel()
@@ -122,7 +122,7 @@ class Link:
             server.close()
         for peer in list(self.peers):
             peer.close("echospline is closing", politely=True)
-        for _ in range(20):  # a peer that does not read cannot hold the program
+        for _ in range(20):  # a peer that does not read cannot delay the end of the program
             if not self.peers:
                 return
             await asyncio.sleep(0.025)
@@ -147,13 +147,15 @@ class Link:
             return
         self.peers.append(peer)
         log.info("%s joined, %d connected", peer.name, len(self.peers))
-        for outgoing in self._newest.values():  # who joins late sees what is there, frozen or not
+        for (
+            outgoing
+        ) in self._newest.values():  # a peer that joins late receives the newest messages, frozen or not
             peer.offer(outgoing)
 
     def _leave(self, peer: Peer, reason: str) -> None:
         if peer in self.peers:
             self.peers.remove(peer)
-        self.farewells = [*self.farewells[-99:], (peer.name, reason)]
+        self.departures = [*self.departures[-99:], (peer.name, reason)]
         log.info(
             "%s left: %s (%d received, %d sent, %d skipped)",
             peer.name, reason, peer.messages, peer.sent, peer.skipped,
@@ -213,5 +215,5 @@ class Link:
         elif prefix in ("STT", "STP"):
             known = any(t == kind for t, _ in self._newest)
             (peer.muted.discard if prefix == "STT" else peer.muted.add)(kind)
-            # the byte of RTS_ says 0 for yes and 1 for no
+            # the byte of RTS_ is 0 for yes and 1 for no
             peer.answer(replace(reply, content=Request(f"RTS_{name}"[:12], b"\0" if known else b"\1")))

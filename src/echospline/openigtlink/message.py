@@ -1,4 +1,4 @@
-"""A message: what it says (content) beside who says it and when; to bytes and back."""
+"""A message: content, device and time, with conversion to bytes and back."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from typing import ClassVar, Protocol
 
 from echospline.errors import InputError, ProtocolError
 from echospline.openigtlink.crc64 import crc64
-from echospline.openigtlink.geometry import Points, PolyData
 from echospline.openigtlink.header import Header
 from echospline.openigtlink.image import Image
 from echospline.openigtlink.metadata import unwrap, wrap
 from echospline.openigtlink.ndarray import NDArrayMessage
+from echospline.openigtlink.polydata import Points, PolyData
 from echospline.openigtlink.pose import Position, Transform
-from echospline.openigtlink.text import Capability, Command, CommandReply, Status, String
+from echospline.openigtlink.text import Capability, CommandMessage, CommandReply, Status, String
 
 PREFIXES = ("GET_", "STT_", "STP_", "RTS_")
 """A question, the start and the end of a stream, and the answer to these."""
 
 
 class Content(Protocol):
-    """What every kind of message can do."""
+    """Interface of every kind of message."""
 
     @property
     def TYPE(self) -> str:
@@ -29,13 +29,13 @@ class Content(Protocol):
         ...
 
     def pack(self) -> bytes:
-        """Bytes between the headers."""
+        """Pack the bytes between the headers."""
         ...
 
 
 @dataclass(frozen=True)
 class Request:
-    """GET_, STT_, STP_ (and RTS_) of any type; what follows depends on the type and is kept as bytes."""
+    """GET_, STT_, STP_ (and RTS_) of any type; its content depends on the type and is kept as bytes."""
 
     type: str
     body: bytes = b""
@@ -46,13 +46,13 @@ class Request:
         return self.type
 
     def pack(self) -> bytes:
-        """Bytes as they are."""
+        """Return the bytes unchanged."""
         return self.body
 
 
 @dataclass(frozen=True)
 class Unread:
-    """A message of a type that echospline does not know, or one whose content does not hold together."""
+    """A message of an unknown type, or one whose content is invalid."""
 
     type: str
     size: int
@@ -64,7 +64,7 @@ class Unread:
         return self.type
 
     def pack(self) -> bytes:
-        """What was not read cannot be sent."""
+        """Raise: a message that was not read cannot be sent."""
         raise InputError(f"a {self.type} that was not read cannot be sent on")
 
 
@@ -76,21 +76,21 @@ class _Readable(Protocol):
 
 
 READABLE: tuple[type[_Readable], ...] = (
-    Transform, Position, Image, Status, String, Command, CommandReply, Points, PolyData, NDArrayMessage, Capability,
+    Transform, Position, Image, Status, String, CommandMessage, CommandReply, Points, PolyData, NDArrayMessage, Capability,
 )  # fmt: skip
 _READERS = {kind.TYPE: kind for kind in READABLE}
 
 
 @dataclass(frozen=True)
 class Message:
-    """Content beside its envelope.
+    """Content with its envelope.
 
     Parameters
     ----------
     content : Content
-        What the message says.
+        Content of the message.
     device : str
-        Who or what it is about; for a transform its name (``NeedleToReference``).
+        The device or object that it describes; for a transform its name (``NeedleToReference``).
     timestamp : float
         Seconds since 1970 at which it was true; 0 if unknown.
     version : int
@@ -115,15 +115,15 @@ class Message:
 
 
 def encode(message: Message, version: int | None = None) -> bytes:
-    """Bytes of a message.
+    """Encode a message as bytes.
 
     Parameters
     ----------
     message : Message
-        What to send.
+        The message.
     version : int, optional
-        Header version instead of the message's own: version 1, which old peers need, drops the metadata
-        that it has no room for.
+        Header version instead of the message's own: version 1, which old peers need, drops the metadata,
+        for which it has no room.
     """
     version = message.version if version is None else version
     content = message.content.pack()
@@ -133,14 +133,14 @@ def encode(message: Message, version: int | None = None) -> bytes:
 
 
 def decode(header: Header, body: bytes) -> Message:
-    """Message of a header and its whole body.
+    """Decode a message from its header and whole body.
 
-    A content that does not hold together becomes `Unread`, with the reason: the stream itself is sound.
+    An invalid content becomes `Unread`, with the reason: the stream itself is sound.
 
     Raises
     ------
     ProtocolError
-        If the check sum is wrong: nothing that follows can be trusted.
+        If the check sum is wrong: nothing that follows is reliable.
     """
     if (actual := crc64(body)) != header.crc:
         raise ProtocolError(

@@ -16,7 +16,7 @@ _COUNT = struct.Struct(">H")
 
 
 def wrap(content: bytes, metadata: Mapping[str, str], message_id: int = 0) -> bytes:
-    """Body of header version 2: extended header, content, metadata.
+    """Build a body of header version 2: extended header, content, metadata.
 
     Raises
     ------
@@ -40,7 +40,7 @@ def wrap(content: bytes, metadata: Mapping[str, str], message_id: int = 0) -> by
 
 
 def unwrap(body: memoryview) -> tuple[memoryview, dict[str, str], int]:
-    """Content, metadata and message id of a body of header version 2.
+    """Split a body of header version 2 into content, metadata and message id.
 
     Raises
     ------
@@ -80,12 +80,12 @@ def _entries(index: memoryview, texts: memoryview) -> dict[str, str]:
 
 
 def encode_text(text: str) -> tuple[int, bytes]:
-    """MIBenum and bytes of a text: ASCII where it can be, else UTF-8."""
+    """Encode a text: MIBenum and bytes, ASCII where possible, else UTF-8."""
     return (3, text.encode("ascii")) if text.isascii() else (106, text.encode("utf-8"))
 
 
 def decode_text(data: memoryview | bytes, encoding: int) -> str:
-    """Text of bytes in the character set ``encoding`` (MIBenum).
+    """Decode bytes in the character set ``encoding`` (MIBenum).
 
     Raises
     ------
@@ -97,7 +97,7 @@ def decode_text(data: memoryview | bytes, encoding: int) -> str:
         raise ProtocolError(
             f"a text is in ASCII (3), Latin-1 (4) or UTF-8 (106); got character set {encoding}"
         )
-    # The C++ library labels what it is given as US-ASCII (3) whatever it holds: UTF-8 reads both.
+    # The C++ library labels every text as US-ASCII (3), whatever it holds: UTF-8 reads both.
     try:
         return bytes(data).decode("utf-8" if name == "ascii" else name)
     except UnicodeDecodeError as error:

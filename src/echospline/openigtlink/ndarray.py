@@ -27,7 +27,7 @@ SCALARS: dict[int, str] = {
 
 
 def scalar_code(array: NDArray[Any], what: str) -> int:
-    """Scalar type of an array's numbers.
+    """Return the scalar type of an array's numbers.
 
     Raises
     ------
@@ -48,12 +48,12 @@ class NDArrayMessage:
     array: NDArray[Any]
 
     def pack(self) -> bytes:
-        """Type, number of axes, lengths, big-endian numbers.
+        """Pack type, number of axes, lengths and big-endian numbers.
 
         Raises
         ------
         InputError
-            If an axis is longer than 65535 or the type of number is not the protocol's.
+            If an axis is longer than 65535 or the protocol has no such type of number.
         """
         a = self.array
         if a.ndim < 1 or a.ndim > 255 or max(a.shape) > 0xFFFF:
@@ -63,7 +63,7 @@ class NDArrayMessage:
 
     @classmethod
     def unpack(cls, content: memoryview) -> NDArrayMessage:
-        """Array of the bytes."""
+        """Unpack an array."""
         if len(content) < 2 or len(content) < 2 + 2 * content[1] or content[1] == 0:
             raise ProtocolError(f"an NDARRAY of {len(content)} bytes ends inside its header or has no axis")
         name = SCALARS.get(content[0])

@@ -10,7 +10,8 @@ from xml.sax.saxutils import quoteattr
 
 from echospline.errors import InputError
 from echospline.openigtlink.message import Message
-from echospline.openigtlink.text import UNKNOWN_ERROR, Command, CommandReply, Status, String
+from echospline.openigtlink.stage import Stage
+from echospline.openigtlink.text import UNKNOWN_ERROR, CommandMessage, CommandReply, Status, String
 
 LONGEST = 16 * 1024
 """Characters of an order."""
@@ -19,12 +20,12 @@ NAMES = {
     "start": "start", "stop": "stop", "reset": "reset", "freeze": "freeze", "unfreeze": "unfreeze",
     "load": "load", "loadscenario": "load", "model": "model", "switchmodel": "model",
 }  # fmt: skip
-"""Orders that are understood, by their name in small letters."""
+"""Orders by their name in small letters."""
 
 
 @dataclass(frozen=True)
 class Order:
-    """What a peer wants done.
+    """An order of a peer.
 
     Parameters
     ----------
@@ -39,7 +40,7 @@ class Order:
 
 
 def order_of(message: Message) -> Order | None:
-    """Order in a STRING or COMMAND, None if it is no order but some other text.
+    """Return the order in a STRING or COMMAND; None if the text is no order.
 
     A text is an order if it is XML ``<Command Name="..." .../>``, if its device says so (``CMD_...``, ``Command``),
     or if it comes as COMMAND.
@@ -47,12 +48,12 @@ def order_of(message: Message) -> Order | None:
     Raises
     ------
     InputError
-        If it is an order that cannot be understood.
+        If it is an unknown or malformed order.
     """
     content = message.content
     if isinstance(content, CommandReply):
         return None
-    if isinstance(content, Command):
+    if isinstance(content, CommandMessage):
         return (
             _from_xml(content.text)
             if content.text.lstrip().startswith("<")
@@ -89,8 +90,40 @@ def _named(name: str, argument: str) -> Order:
     return Order(NAMES[key], argument.strip())
 
 
+def carry_out(order: Order, stage: Stage) -> str:
+    """Carry out an order, other than to load a scenario; returns a sentence for the peer.
+
+    Raises
+    ------
+    InputError
+        If the stage has no such model or no planned insertion.
+    """
+    engine, insertion = stage.engine, stage.insertion
+    if order.name == "start":
+        if insertion is None:
+            raise InputError("there is no planned insertion to start: load a scenario that has one")
+        engine.freeze(False)
+        times = (k * engine.period for k in range(1, int(insertion.duration / engine.period) + 1))
+        engine.replay(insertion.pose(float(insertion.times[0]) + t) for t in times)
+        return f"the planned insertion runs, {insertion.duration:.1f} s"
+    if order.name == "stop":
+        engine.freeze(True)
+        return "time stands still"
+    if order.name == "reset":
+        engine.reset()
+        return "needle and tissue are at rest"
+    if order.name in ("freeze", "unfreeze"):
+        on = order.name == "freeze" and order.argument.lower() not in ("off", "false", "0")
+        engine.freeze(on)
+        return "time stands still" if on else "time runs"
+    if order.argument not in stage.models:
+        raise InputError(f"a model is one of {', '.join(stage.models)}; got {order.argument!r}")
+    engine.switch(order.argument)
+    return f"the tissue is {order.argument} now"
+
+
 def answer(message: Message, text: str, *, done: bool) -> Message:
-    """Tell the peer what became of its order, in the form in which it asked.
+    """Build the answer to an order, in the form of the order.
 
     Parameters
     ----------
@@ -98,14 +131,14 @@ def answer(message: Message, text: str, *, done: bool) -> Message:
         The order: STRING of device ``CMD_id`` is answered by STRING ``ACK_id``, COMMAND by RTS_COMMAND, other
         STRING by STATUS.
     text : str
-        What happened.
+        The result.
     done : bool
         Whether the order was carried out.
     """
     status = "SUCCESS" if done else "FAIL"
     xml = f"<CommandReply Status={quoteattr(status)} Message={quoteattr(text)} />"
     content = message.content
-    if isinstance(content, Command):
+    if isinstance(content, CommandMessage):
         error = "" if done else text.encode("ascii", "replace").decode()[:100]
         said = CommandReply(content.id, error, xml)
         return Message(

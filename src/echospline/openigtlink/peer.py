@@ -1,4 +1,4 @@
-"""One connection: its stream of bytes, what it may still receive, and why it ended."""
+"""One connection: its stream of bytes, the messages that wait for it, and the reason of its end."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ from echospline.openigtlink.message import Message, Unread, encode
 log = logging.getLogger("echospline.openigtlink")
 
 Key = tuple[str, str]
-"""Type and device: of two messages with the same key only the newer matters."""
+"""Type and device: of two messages with the same key only the newer is kept."""
 
 _SLICE = 16 * 1024
-"""Bytes of one peer handled before the others have their turn."""
+"""Bytes of one peer handled before those of the others."""
 
 
 @dataclass(frozen=True)
 class Patience:
-    """How long a peer may do nothing, and how much may wait for it.
+    """Time limits of a peer, and the amount of data that may wait for it.
 
     Parameters
     ----------
     partial : float
         Seconds in the middle of a message before the stream counts as truncated.
     stall : float
-        Seconds without taking a byte while bytes wait before the peer counts as gone.
+        Seconds without reading a byte while bytes wait before the peer counts as gone.
     lost : float
         Seconds after which the system gives up a connection whose other end no longer answers
-        (keep-alive probes, unacknowledged bytes): the protocol itself has no sign of life.
+        (keep-alive probes, unacknowledged bytes): the protocol itself has no heartbeat.
     buffer : int
-        Bytes that the system may hold for the peer; more would only hold images that are old already.
+        Bytes that the system may hold for the peer; a larger buffer would hold only outdated images.
     answers : int
         Answers to questions that may wait; a peer that asks and never reads is closed.
     """
@@ -49,7 +49,7 @@ class Patience:
 
 
 class Outgoing:
-    """A message that several peers get: packed once for each header version that is asked for."""
+    """A message for several peers: packed once for each header version needed."""
 
     def __init__(self, message: Message) -> None:
         self.message = message
@@ -61,7 +61,7 @@ class Outgoing:
         return self.message.type, self.message.device
 
     def packed(self, version: int) -> bytes:
-        """Bytes for a peer that understands header ``version``."""
+        """Encode for a peer that understands header ``version``."""
         if version not in self._bytes:
             self._bytes[version] = encode(self.message, version)
         return self._bytes[version]
@@ -70,17 +70,17 @@ class Outgoing:
 class Peer(asyncio.Protocol):
     """A connected program.
 
-    What is streamed to it waits in one slot per type and device, where a newer message replaces an older
-    one that was not sent yet: a peer that reads slowly skips messages, and no other peer notices.
+    A streamed message waits in one slot per type and device, where a newer message replaces an older
+    one that was not sent yet: a peer that reads slowly skips messages without an effect on the others.
 
     Parameters
     ----------
     received : callable
         Called with (peer, message) for each message.
     left : callable
-        Called with (peer, reason) once, when the connection is over.
+        Called with (peer, reason) once, when the connection ends.
     joined : callable
-        Called with the peer when the connection stands.
+        Called with the peer when the connection is made.
     patience : Patience
         Its limits.
     """
@@ -96,11 +96,11 @@ class Peer(asyncio.Protocol):
         self._patience = patience
         self.name = "?"
         self.version = 1
-        """Header version spoken to it: 1 until it shows that it knows 2."""
+        """Header version sent to it: 1 until it sends version 2."""
         self.muted: set[str] = set()
-        """Types it asked not to be sent (STP_)."""
-        self.speaks: set[Key] = set()
-        """What it sends itself."""
+        """Types that it asked not to receive (STP_)."""
+        self.sends: set[Key] = set()
+        """Type and device of the messages that it sends."""
         self.messages = 0
         """Messages received."""
         self.sent = 0
@@ -119,7 +119,7 @@ class Peer(asyncio.Protocol):
         self._heard = self._moved = 0.0
         self._waiting = 0
 
-    # ---- what the link asks of it
+    # ---- called by the link
 
     def offer(self, outgoing: Outgoing) -> None:
         """Send as soon as the peer can take it, unless a newer one of its kind comes first."""
@@ -131,7 +131,7 @@ class Peer(asyncio.Protocol):
         self._flush()
 
     def answer(self, message: Message) -> None:
-        """Send this message, whatever comes after it."""
+        """Send this message, even if newer ones follow."""
         if len(self._answers) >= self._patience.answers:
             self.close(f"it asked {len(self._answers)} questions and read no answer")
             return
@@ -139,7 +139,7 @@ class Peer(asyncio.Protocol):
         self._flush()
 
     def close(self, reason: str, *, politely: bool = False) -> None:
-        """End the connection; ``politely`` sends what waits first."""
+        """End the connection; ``politely`` sends waiting messages first."""
         if self._transport is None:
             return
         self._reason = self._reason or reason
@@ -162,13 +162,13 @@ class Peer(asyncio.Protocol):
         elif now - self._moved > self._patience.stall:
             self.close(f"stalled: it took no byte for {self._patience.stall:g} s while {waiting} waited")
 
-    # ---- what asyncio tells it
+    # ---- called by asyncio
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Begin."""
+        """Set up the connection."""
         assert isinstance(transport, asyncio.Transport)
         self._transport = transport
-        # above one byte the transport says stop: the newest message then waits in its slot, not in a queue
+        # above one byte the transport pauses writing: the newest message then waits in its slot, not in a queue
         transport.set_write_buffer_limits(high=0)
         self._set_socket(transport.get_extra_info("socket"))
         host, port, *_ = transport.get_extra_info("peername") or ("?", 0)
@@ -180,7 +180,7 @@ class Peer(asyncio.Protocol):
         p = self._patience
         options = [
             (socket.SOL_SOCKET, "SO_KEEPALIVE", 1),
-            (socket.SOL_SOCKET, "SO_SNDBUF", p.buffer // 2),  # Linux takes the number twice
+            (socket.SOL_SOCKET, "SO_SNDBUF", p.buffer // 2),  # Linux counts the number twice
             (socket.IPPROTO_TCP, "TCP_NODELAY", 1),
             (socket.IPPROTO_TCP, "TCP_KEEPIDLE", max(1, round(p.lost / 3))),
             (socket.IPPROTO_TCP, "TCP_KEEPINTVL", max(1, round(p.lost / 6))),
@@ -188,11 +188,11 @@ class Peer(asyncio.Protocol):
             (socket.IPPROTO_TCP, "TCP_USER_TIMEOUT", round(p.lost * 1000)),
         ]
         for level, name, value in options:
-            if hasattr(socket, name):  # not every system has all of them
+            if hasattr(socket, name):  # some systems lack some of these options
                 connection.setsockopt(level, getattr(socket, name), value)
 
     def data_received(self, data: bytes) -> None:
-        """Take bytes."""
+        """Decode bytes received."""
         self._heard = asyncio.get_running_loop().time()
         self._pending += data
         if not self._working:
@@ -224,17 +224,17 @@ class Peer(asyncio.Protocol):
         self.version = max(self.version, min(message.version, 2))
         content = message.content
         if isinstance(content, Unread):
-            self._complain(message, "passed over", content.reason or "echospline does not know this type")
+            self._log_once(message, "passed over", content.reason or "echospline does not know this type")
             return
-        if len(self.speaks) < 1000:
-            self.speaks.add((message.type, message.device))
+        if len(self.sends) < 1000:
+            self.sends.add((message.type, message.device))
         try:
             self._received(self, message)
         except InputError as error:
-            self._complain(message, "refused", str(error))
+            self._log_once(message, "refused", str(error))
 
-    def _complain(self, message: Message, fate: str, reason: str) -> None:
-        """Log once per reason: a tracker repeats itself a thousand times a second."""
+    def _log_once(self, message: Message, fate: str, reason: str) -> None:
+        """Log once per reason: a tracker repeats the same fault a thousand times a second."""
         if (message.type, reason) not in self._complained and len(self._complained) < 100:
             self._complained.add((message.type, reason))
             log.warning("a %s of %s from %s is %s: %s", message.type, message.device, self.name, fate, reason)
@@ -244,7 +244,7 @@ class Peer(asyncio.Protocol):
         self._writable = False
 
     def resume_writing(self) -> None:
-        """Go on sending."""
+        """Resume sending."""
         self._writable = True
         self._flush()
 
@@ -261,7 +261,7 @@ class Peer(asyncio.Protocol):
             transport.write(outgoing.packed(self.version))
 
     def eof_received(self) -> bool:
-        """Close: nothing more will come."""
+        """Close the connection: the other end sends nothing more."""
         unfinished = self._decoder.waiting_for
         self._reason = self._reason or (
             f"it closed in the middle of {unfinished}" if unfinished else "it closed the connection"
@@ -269,7 +269,7 @@ class Peer(asyncio.Protocol):
         return False
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """End."""
+        """Report the end of the connection."""
         self._transport = None
         self._slots.clear()
         self._answers.clear()

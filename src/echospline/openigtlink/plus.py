@@ -8,15 +8,14 @@ from xml.etree import ElementTree
 import numpy as np
 
 from echospline.errors import InputError
-from echospline.grid import Floats
-from echospline.openigtlink.frames import frames_of
+from echospline.scene import Floats, frames_of
 
 LARGEST = 2**20
 """Bytes of a device set file."""
 
 
 def read_calibration(path: str | Path) -> dict[str, Floats]:
-    """Fixed transforms of a PLUS device set file (``PlusDeviceSet_....xml``).
+    """Read the fixed transforms of a PLUS device set file (``PlusDeviceSet_....xml``).
 
     Raises
     ------

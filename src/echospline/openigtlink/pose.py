@@ -1,4 +1,4 @@
-"""Where a tool is: TRANSFORM (a 4 x 4 matrix) and POSITION (a point and a quaternion)."""
+"""Pose of a tool: TRANSFORM (a 4 x 4 matrix) and POSITION (a point and a quaternion)."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from typing import ClassVar
 
 import numpy as np
 
-from echospline.errors import InputError, ProtocolError
-from echospline.grid import Floats
+from echospline.errors import ProtocolError
+from echospline.scene import Floats, as_transform
 
 _COLUMNS = struct.Struct(">12f")
 
 
 @dataclass(frozen=True, eq=False)
 class Transform:
-    """TRANSFORM: takes column vectors of the frame named first to the one named second (``NeedleToReference``).
+    """TRANSFORM: maps column vectors of the frame named first to the one named second (``NeedleToReference``).
 
     Parameters
     ----------
@@ -31,12 +31,12 @@ class Transform:
         object.__setattr__(self, "matrix", as_transform(self.matrix))
 
     def pack(self) -> bytes:
-        """48 bytes: the columns, without the last row."""
+        """Pack 48 bytes: the columns, without the last row."""
         return self.matrix[:3].T.astype(">f4").tobytes()
 
     @classmethod
     def unpack(cls, content: memoryview) -> Transform:
-        """Matrix of 48 bytes."""
+        """Unpack a matrix of 48 bytes."""
         if len(content) != _COLUMNS.size:
             raise ProtocolError(f"a TRANSFORM has 48 bytes; got {len(content)}")
         matrix = np.eye(4)
@@ -58,12 +58,12 @@ class Position:
     quaternion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
 
     def pack(self) -> bytes:
-        """28 bytes."""
+        """Pack 28 bytes."""
         return struct.pack(">7f", *self.position, *self.quaternion)
 
     @classmethod
     def unpack(cls, content: memoryview) -> Position:
-        """Position of 12, 24 or 28 bytes."""
+        """Unpack 12, 24 or 28 bytes."""
         if len(content) not in (12, 24, 28):
             raise ProtocolError(f"a POSITION has 12, 24 or 28 bytes; got {len(content)}")
         values = [float(v) for v in np.frombuffer(content, dtype=">f4")]
@@ -74,12 +74,12 @@ class Position:
         return cls((values[0], values[1], values[2]), (x, y, z, w))
 
     def matrix(self) -> Floats:
-        """The same as a 4 x 4 matrix.
+        """Return the pose as a 4 x 4 matrix.
 
         Raises
         ------
         ProtocolError
-            If the quaternion is no rotation (its length is not 1 within a thousandth).
+            If the quaternion is not a rotation (its length is not 1 within a thousandth).
         """
         x, y, z, w = self.quaternion
         length = (x * x + y * y + z * z + w * w) ** 0.5
@@ -94,20 +94,3 @@ class Position:
                 [0.0, 0.0, 0.0, 1.0],
             ]
         )
-
-
-def as_transform(matrix: Floats) -> Floats:
-    """Check a 4 x 4 matrix and return it as float64.
-
-    Raises
-    ------
-    InputError
-        If the shape is another, a number is not finite or the last row is not 0 0 0 1.
-    """
-    array = np.array(matrix, dtype=np.float64)
-    if array.shape != (4, 4):
-        raise InputError(f"a transform is a 4 x 4 matrix; got shape {array.shape}")
-    if not np.isfinite(array).all() or not np.array_equal(array[3], (0, 0, 0, 1)):
-        raise InputError(f"a transform has finite numbers and the last row 0 0 0 1; got {array.tolist()}")
-    array.setflags(write=False)
-    return array

@@ -1,4 +1,4 @@
-"""What a session simulates, how often it tells, and on what terms it meets its peers."""
+"""The scene that a session simulates, its rates, and its options for peers."""
 
 from __future__ import annotations
 
@@ -6,17 +6,15 @@ from dataclasses import dataclass, field
 from math import isfinite
 
 from echospline.errors import InputError
-from echospline.image import UltrasoundImage
 from echospline.live import LiveEngine
-from echospline.needle import Insertion
 from echospline.openigtlink.link import PORT, LinkLimits
-from echospline.openigtlink.picture import Looks
-from echospline.openigtlink.scene import Reach
+from echospline.openigtlink.outgoing import Looks
+from echospline.scene import Insertion, Reach, UltrasoundImage
 
 
 @dataclass(frozen=True)
 class Stage:
-    """What is simulated.
+    """The simulated scene.
 
     Parameters
     ----------
@@ -27,7 +25,7 @@ class Stage:
     models : tuple of str
         Names that the engine can be switched to.
     insertion : Insertion, optional
-        The path that `start` plays.
+        The path for the order `start`.
     """
 
     image: UltrasoundImage
@@ -38,7 +36,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class Rates:
-    """How often what is sent.
+    """Rates of sending.
 
     Parameters
     ----------
@@ -64,7 +62,7 @@ class Rates:
 
 @dataclass(frozen=True)
 class SessionOptions:
-    """How a session behaves.
+    """Options of a session.
 
     Parameters
     ----------
@@ -77,11 +75,11 @@ class SessionOptions:
     looks : Looks
         Names of frames, the needle's looks.
     reach : Reach
-        What counts as near the plane.
+        Distances within which the needle counts as near the plane.
     rates : Rates
-        How often what is sent.
+        Rates of sending.
     limits : LinkLimits
-        What the link takes upon itself.
+        Limits of the link.
     """
 
     host: str = "127.0.0.1"

@@ -1,4 +1,4 @@
-"""Words between peers: STRING, STATUS, COMMAND with its answer RTS_COMMAND, CAPABILITY."""
+"""Texts between peers: STRING, STATUS, COMMAND with its answer RTS_COMMAND, CAPABILITY."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class String:
     text: str
 
     def pack(self) -> bytes:
-        """Character set, length, text."""
+        """Pack character set, length and text."""
         encoding, data = encode_text(self.text)
         if len(data) > 0xFFFF:
             raise InputError(f"a STRING has at most 65535 bytes; got {len(data)}")
@@ -35,7 +35,7 @@ class String:
 
     @classmethod
     def unpack(cls, content: memoryview) -> Self:
-        """Text of the bytes."""
+        """Unpack a text."""
         if len(content) < _STRING.size:
             raise ProtocolError(f"a STRING has 4 bytes or more; got {len(content)}")
         encoding, length = _STRING.unpack_from(content)
@@ -46,7 +46,7 @@ class String:
 
 @dataclass(frozen=True)
 class Status:
-    """STATUS: a code (1 is OK), a sub-code, the name of the error and words about it."""
+    """STATUS: a code (1 is OK), a sub-code, the name of the error and a text."""
 
     TYPE: ClassVar[str] = "STATUS"
     code: int = OK
@@ -55,13 +55,13 @@ class Status:
     text: str = ""
 
     def pack(self) -> bytes:
-        """30 bytes and the text, ended by a zero as C programs expect."""
+        """Pack 30 bytes and the text, ended by a zero as C programs expect."""
         head = _STATUS.pack(self.code, self.subcode, pack_name(self.error, 20, "error name"))
         return head + self.text.encode("utf-8") + b"\0"
 
     @classmethod
     def unpack(cls, content: memoryview) -> Self:
-        """Status of the bytes."""
+        """Unpack a status."""
         if len(content) < _STATUS.size:
             raise ProtocolError(f"a STATUS has 30 bytes or more; got {len(content)}")
         code, subcode, error = _STATUS.unpack_from(content)
@@ -70,7 +70,7 @@ class Status:
 
 
 @dataclass(frozen=True)
-class Command:
+class CommandMessage:
     """COMMAND: a numbered order; its text is free, Slicer and PLUS write XML."""
 
     TYPE: ClassVar[str] = "COMMAND"
@@ -79,14 +79,14 @@ class Command:
     text: str = ""
 
     def pack(self) -> bytes:
-        """Number, name in 128 bytes, character set, length, text."""
+        """Pack number, name in 128 bytes, character set, length and text."""
         encoding, data = encode_text(self.text)
         name = pack_name(self.name, 127, "command name")
         return struct.pack(">I128sHI", self.id, name, encoding, len(data)) + data
 
     @classmethod
     def unpack(cls, content: memoryview) -> Self:
-        """Command of the bytes; the width of the name is the one with which the length adds up."""
+        """Unpack a command; the width of the name is the one that fits the length."""
         for width in _COMMAND_NAMES:
             layout = struct.Struct(f">I{width}sHI")
             if len(content) < layout.size:
@@ -99,8 +99,8 @@ class Command:
 
 
 @dataclass(frozen=True)
-class CommandReply(Command):
-    """RTS_COMMAND: the answer to the `Command` of the same number; its name is the error's, empty if none."""
+class CommandReply(CommandMessage):
+    """RTS_COMMAND: the answer to the `CommandMessage` of the same number; its name is the error's, empty if none."""
 
     TYPE: ClassVar[str] = "RTS_COMMAND"
 
@@ -113,12 +113,12 @@ class Capability:
     types: tuple[str, ...]
 
     def pack(self) -> bytes:
-        """12 bytes for each name; the body size counts them."""
+        """Pack 12 bytes for each name; the body size gives their number."""
         return b"".join(pack_name(t, 12, "message type").ljust(12, b"\0") for t in self.types)
 
     @classmethod
     def unpack(cls, content: memoryview) -> Self:
-        """Types of the bytes."""
+        """Unpack the types."""
         if len(content) % 12:
             raise ProtocolError(f"a CAPABILITY has a multiple of 12 bytes; got {len(content)}")
         starts = range(0, len(content), 12)

@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
-from echospline.errors import EchosplineError, InputError
-from echospline.live import LiveEngine, Numbered, Pacer, Snapshot
-from echospline.needle import NeedlePose
+from echospline.errors import EchosplineError, InputError, ProtocolError
+from echospline.live import LiveEngine, Numbered, Pacer, Recorder, Snapshot, Trace
+from echospline.scene import NeedlePose
 from echospline.viewer import protocol
 from echospline.viewer.exercise import Exercise
 from echospline.viewer.guard import Allowance
-from echospline.viewer.scene import Scene, tip_of
-from echospline.viewer.scoring import Recorder, Score, Trace, score
+from echospline.viewer.scoring import Score, score
+from echospline.viewer.served_scene import Scene, tip_of
 from echospline.viewer.sessions import Sessions
 
 log = logging.getLogger(__name__)
@@ -29,12 +29,12 @@ IN_FLIGHT = 2
 PLOT_POINTS = 400
 """Points of the summary's plot."""
 FASTEST_DISPLAY, AHEAD = 1 / 60, 0.008
-"""s; a frame is sent this long before the page draws again, as its reports foretell, and not sooner: a snapshot
-sent at once would be old by then, and a second one would have to follow it."""
+"""s; a frame is sent this long before the next refresh of the page (predicted from its reports) and not sooner:
+a snapshot sent at once would be outdated by then, and a second one would have to follow it."""
 STILL, KEEP_ALIVE = 5e-4, 0.1
-"""mm and s: while nothing moves further than that from the picture shown, frames come only this often."""
+"""mm and s: while nothing moves further than that from the picture shown, frames are sent only at this interval."""
 NODES_UP_TO = 4000
-"""Mesh nodes beyond which a spline's weights go out instead, where the model offers them: fitting them takes the
+"""Mesh nodes beyond which a spline's weights are sent instead, where the model offers them: fitting them takes the
 server longer than sending 9.6 kB of 1200 nodes, and less than the 160 kB of 20 000."""
 HISTORY = 50
 """Earlier sessions of the same exercise in the summary."""
@@ -51,7 +51,7 @@ class Training:
 
 
 class Seat:
-    """An engine with what belongs to it; it outlives a reload of its page for a while."""
+    """An engine with its scene and exercise; it is kept for a while after its page closes, so that a reload resumes."""
 
     def __init__(self, scene: Scene, rate: float) -> None:
         self.scene = scene
@@ -60,7 +60,7 @@ class Seat:
         self.model, self.compared = scene.names[0][0], ""
 
     def end_training(self) -> None:
-        """Stop recording, and watching the targets."""
+        """Stop recording and stop watching the targets."""
         if self.training is not None:
             self.engine.unobserve(self.training.recorder)
             self.training = None
@@ -77,7 +77,7 @@ class Client:
     seat : Seat
         The engine; this client runs it while it is connected.
     sessions : Sessions
-        Where finished exercises go.
+        Storage of finished exercises.
     nodes : bool, optional
         Send node displacements even where the model offers a spline; by default up to `NODES_UP_TO` nodes.
     """
@@ -95,8 +95,8 @@ class Client:
         self._credit.set()
 
     async def serve(self, resumed: bool) -> None:
-        """Serve until the page goes or breaks the protocol; the engine's thread ends with it."""
-        await self._tell("scene", **self._describe(resumed))
+        """Serve until the page closes or breaks the protocol; the engine's thread ends with it."""
+        await self._send_text("scene", **self._describe(resumed))
         with Pacer(self.seat.engine):
             tasks = [asyncio.create_task(self._receive()), asyncio.create_task(self._send_frames())]
             try:
@@ -133,20 +133,20 @@ class Client:
                 return
             if (data := message.get("bytes")) is not None:
                 if not self._commands.take():
-                    raise protocol.ProtocolError("too many messages: this page was closed for flooding")
+                    raise ProtocolError("too many messages: this page was closed for flooding")
                 self._take_command(protocol.decode_command(data))
             else:
                 if not self._requests.take():
-                    raise protocol.ProtocolError("too many requests: this page was closed for flooding")
+                    raise ProtocolError("too many requests: this page was closed for flooding")
                 await self._answer(protocol.decode_request(message["text"]))
 
     def _take_command(self, command: protocol.PoseCommand) -> None:
         if command.drawn > self._sent or command.drawn < self._drawn:
-            raise protocol.ProtocolError(
+            raise ProtocolError(
                 f"frames {self._drawn} to {self._sent} can have been drawn now; got {command.drawn}"
             )
         if command.number <= self._number:
-            raise protocol.ProtocolError(f"command numbers ascend; got {command.number} after {self._number}")
+            raise ProtocolError(f"command numbers ascend; got {command.number} after {self._number}")
         if command.drawn > self._drawn:
             now = asyncio.get_running_loop().time()
             self._intervals.append(now - self._reported)
@@ -172,7 +172,9 @@ class Client:
             case protocol.Compare(name=name) if name is None or name in names:
                 engine.compare(name)
             case protocol.SwitchModel(name=name) | protocol.Compare(name=name):
-                await self._tell("notice", text=f"there is no model {name!r} here; it has {', '.join(names)}")
+                await self._send_text(
+                    "notice", text=f"there is no model {name!r} here; it has {', '.join(names)}"
+                )
             case protocol.StartExercise():
                 await self._start(request)
             case protocol.FinishExercise(keep=keep):
@@ -185,13 +187,13 @@ class Client:
     async def _start(self, request: protocol.StartExercise) -> None:
         exercise = self.seat.scene.exercise(request.exercise)
         if exercise is None:
-            await self._tell("notice", text=f"there is no exercise {request.exercise!r} here")
+            await self._send_text("notice", text=f"there is no exercise {request.exercise!r} here")
             return
         self._begin(
             Training(exercise, Recorder(self.seat.engine.period, exercise.time_limit), request.trainee)
         )
         self.seat.engine.reset()
-        await self._tell("running", exercise=exercise.name, replay=False)
+        await self._send_text("running", exercise=exercise.name, replay=False)
 
     def _begin(self, training: Training) -> None:
         self.seat.end_training()
@@ -202,15 +204,15 @@ class Client:
     async def _finish(self, keep: bool) -> None:
         training, newest = self.seat.training, self.seat.engine.snapshots.latest()
         if training is None or newest is None:
-            await self._tell("notice", text="no exercise is running")
+            await self._send_text("notice", text="no exercise is running")
             return
         trace, model = training.recorder.trace(), newest.value.model
         self.seat.end_training()
         if not keep:
-            await self._tell("stopped")
+            await self._send_text("stopped")
             return
         summary = await asyncio.to_thread(self._summary, training, trace, model)
-        await self._tell("summary", **summary)
+        await self._send_text("summary", **summary)
 
     def _summary(self, training: Training, trace: Trace, model: str) -> dict[str, Any]:
         result = score(trace, training.exercise)
@@ -243,14 +245,14 @@ class Client:
                     "this session was recorded in another image: its targets lie outside this one"
                 )
         except EchosplineError as error:
-            await self._tell("notice", text=str(error))
+            await self._send_text("notice", text=str(error))
             return
         recorder = Recorder(self.seat.engine.period, self.seat.engine.period * len(poses))
         self._begin(Training(exercise, recorder, session.trainee, number))
         if session.model in [name for name, _ in self.seat.scene.names]:
             self.seat.engine.switch(session.model)
         self.seat.engine.replay(poses)
-        await self._tell("running", exercise=exercise.model_dump(), replay=True, model=session.model)
+        await self._send_text("running", exercise=exercise.model_dump(), replay=True, model=session.model)
 
     # --- to the page
 
@@ -268,7 +270,7 @@ class Client:
             if snapshot.failure != self._failure:
                 self._failure = snapshot.failure
                 if snapshot.failure is not None:
-                    await self._tell("failure", text=snapshot.failure)
+                    await self._send_text("failure", text=snapshot.failure)
             self._sent += 1
             if self._sent - self._drawn >= IN_FLIGHT:
                 self._credit.clear()
@@ -298,10 +300,10 @@ class Client:
         slot.call_when_newer(number, wake)
         await here.wait()
         newest = slot.latest()
-        assert newest is not None  # it has just been announced
+        assert newest is not None  # the callback has announced it
         return newest
 
-    async def _tell(self, what: str, **content: object) -> None:
+    async def _send_text(self, what: str, **content: object) -> None:
         async with self._sending:
             await self.socket.send_text(json.dumps({"tell": what, **content}, allow_nan=False))
 
@@ -309,7 +311,7 @@ class Client:
         """Close with the reason, if the page is still there."""
         if error is None or isinstance(error, asyncio.CancelledError | WebSocketDisconnect):
             return
-        if isinstance(error, protocol.ProtocolError):
+        if isinstance(error, ProtocolError):
             log.warning("client closed: %s", error)
             code, reason = 1008, str(error)
         else:
@@ -321,7 +323,7 @@ class Client:
 
 
 def is_still(shown: Snapshot, now: Snapshot) -> bool:
-    """Whether a frame of ``now`` would look like that of ``shown``: same needle, tissue within `STILL` mm."""
+    """Test whether a frame of ``now`` would look like that of ``shown``: same needle, tissue within `STILL` mm."""
     same = shown.pose == now.pose and shown.command == now.command and shown.model == now.model
     flags = (shown.frozen, shown.replaying, shown.failure) == (now.frozen, now.replaying, now.failure)
     if not (same and flags and len(shown.watched) == len(now.watched)):
@@ -332,7 +334,7 @@ def is_still(shown: Snapshot, now: Snapshot) -> bool:
 
 
 def resampled(trace: Trace, period: float) -> list[NeedlePose]:
-    """Poses of a trace at an engine's period; unchanged when it is the trace's own."""
+    """Resample the poses of a trace at an engine's period; unchanged when the periods are equal."""
     if len(trace) == 0:
         raise InputError("this session holds no motion")
     if abs(trace.period - period) < 1e-12:
@@ -345,7 +347,7 @@ def resampled(trace: Trace, period: float) -> list[NeedlePose]:
 
 
 def summary_of(number: int, exercise: Exercise, trace: Trace, result: Score) -> dict[str, Any]:
-    """What the page shows at the end, the plots thinned out."""
+    """Build the summary for the page, with few enough points for its plots."""
     if len(trace) == 0:
         rows, distance = np.empty(0, dtype=int), np.empty(0)
     else:

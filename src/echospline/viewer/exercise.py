@@ -1,6 +1,6 @@
-"""Exercises: a target in the tissue, perhaps vessels to avoid, and what counts as done.
+"""Exercises: a target in the tissue, perhaps vessels to avoid, and the criteria of success.
 
-They are the ``[[exercise]]`` tables of a scenario; three come with any image.
+They are the ``[[exercise]]`` tables of a scenario; three are provided for any image.
 """
 
 from __future__ import annotations
@@ -8,15 +8,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from echospline.errors import InputError
-from echospline.grid import RegularGrid
-from echospline.sections import DiscSection as Disc
-from echospline.sections import ExerciseSection as Exercise
+from echospline.scenario import DiscSection as Disc
+from echospline.scenario import ExerciseSection as Exercise
+from echospline.scene import RegularGrid
 
 __all__ = ["Disc", "Exercise", "check_exercises", "default_exercises"]
 
 
 def check_exercises(exercises: Sequence[Exercise], grid: RegularGrid) -> None:
-    """Check what the tables alone cannot tell.
+    """Check names and positions of exercises against each other and the mesh.
 
     Raises
     ------
@@ -36,7 +36,7 @@ def check_exercises(exercises: Sequence[Exercise], grid: RegularGrid) -> None:
 
 
 def default_exercises(grid: RegularGrid) -> tuple[Exercise, ...]:
-    """Three exercises that fit any image: their places are fractions of its extent."""
+    """Return three exercises that fit any image: their places are fractions of its extent."""
     x0, x1, y0, y1 = grid.extent
     size = min(x1 - x0, y1 - y0)
 

@@ -1,4 +1,4 @@
-"""Who may talk to the server: Host, Origin and token are checked before anything else; floods are counted."""
+"""Access to the server: Host, Origin and token are checked before anything else, and messages are counted."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 SUBPROTOCOL = "echospline.1"
-"""Offered by the page; a token travels beside it as ``token.<token>``, for a page cannot set headers there."""
+"""Offered by the page; a token is sent with it as ``token.<token>``, because a page cannot set headers there."""
 
 SECURITY_HEADERS = {
     "Content-Security-Policy": (
@@ -26,23 +26,23 @@ SECURITY_HEADERS = {
     "Cache-Control": "no-cache",
 }
 PUBLIC = ("/static/", "/favicon.ico")
-"""Paths that hold nothing secret: the page itself must load before it can present its token."""
+"""Paths without secrets: the page itself must load before it can present its token."""
 
 
 class Guard:
-    """Refuses requests by foreign names, pages and token-less clients, and adds the security headers.
+    """Refuses requests with foreign host names, from foreign pages and without a token, and adds the security headers.
 
     A page of another site may make a browser connect here, and may give its own name this machine's address;
-    the checks of Origin and Host are what stops that.
+    the checks of Origin and Host prevent that.
 
     Parameters
     ----------
     app : ASGI application
-        What is guarded.
+        The guarded application.
     hosts : frozenset of str, or None
         Host names that are accepted (without port); None accepts any and relies on the token.
     token : str or None
-        What a client must present, if anything.
+        Token that a client must present, if any.
     """
 
     def __init__(self, app: ASGIApp, hosts: frozenset[str] | None, token: str | None) -> None:
@@ -71,7 +71,7 @@ class Guard:
         await self.app(scope, receive, send_with_headers)
 
     def refusal(self, scope: Scope) -> tuple[int, str] | None:
-        """Status and reason if this connection is refused."""
+        """Return the status and reason if this connection is refused."""
         headers = Headers(scope=scope)
         hosts, origins = headers.getlist("host"), headers.getlist("origin")
         if len(hosts) != 1:
@@ -89,7 +89,7 @@ class Guard:
         return None
 
     def _token_matches(self, headers: Headers) -> bool:
-        assert self.token is not None  # the caller asked
+        assert self.token is not None  # checked by the caller
         offered = [part.strip() for part in headers.get("sec-websocket-protocol", "").split(",")]
         given = [part.removeprefix("token.") for part in offered if part.startswith("token.")]
         scheme, _, bearer = headers.get("authorization", "").partition(" ")
@@ -99,7 +99,7 @@ class Guard:
 
 
 def _host_name(host: str) -> str | None:
-    """Name in a Host header without the port, lower case; None if it is malformed."""
+    """Return the name in a Host header without the port, lower case; None if it is malformed."""
     try:
         parts = urlsplit(f"//{host}")
         _ = parts.port
@@ -111,14 +111,14 @@ def _host_name(host: str) -> str | None:
 
 
 class Allowance:
-    """A budget of messages that refills with time; empty means flooding.
+    """A budget of messages that refills with time; a client that empties it is flooding.
 
     Parameters
     ----------
     rate : float
-        Messages per second that may go on for ever.
+        Sustained messages per second.
     burst : float
-        Messages that may come at once.
+        Messages allowed at once.
     clock : callable
         s.
     """
@@ -128,7 +128,7 @@ class Allowance:
         self._left, self._last = burst, clock()
 
     def take(self) -> bool:
-        """Count one message; False if it is one too many."""
+        """Count one message; returns False if it is one too many."""
         now = self._clock()
         self._left = min(self.burst, self._left + self.rate * (now - self._last))
         self._last = now

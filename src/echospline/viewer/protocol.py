@@ -1,12 +1,12 @@
-"""The wire between page and server, version 1: little-endian binary for what flows, small JSON for what is asked.
+"""Protocol of page and server, version 1: little-endian binary for commands and frames, small JSON for requests.
 
 Page to server, every time a frame was drawn or the needle moved: a *command* of 36 bytes. Server to page,
 only when an earlier frame was drawn: a *frame*, which is a header of 68 bytes, the positions of the watched
 points, and the field: either the displacement of every mesh node (any model), or the landmarks and
 weights of a spline, which the page evaluates where it draws (1.7 kB for 105 landmarks, whatever the mesh).
-Everything a person asks for in words (reset, model, exercise) is a JSON *request* of at most 4096 bytes.
+Everything else (reset, model, exercise) is a JSON *request* of at most 4096 bytes.
 
-`static/protocol.js` is the same in JavaScript; both are held to the same golden bytes.
+`static/protocol.js` is the same in JavaScript; tests compare both with the same golden bytes.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from echospline.errors import InputError
+from echospline.errors import ProtocolError
 from echospline.live import Snapshot
 
 VERSION = 1
@@ -41,13 +41,9 @@ MAX_LENGTH = 1000.0
 """mm; no coordinate or depth of a command lies beyond it."""
 
 
-class ProtocolError(InputError):
-    """A message that breaks the protocol; its client is closed with the reason."""
-
-
 @dataclass(frozen=True, slots=True)
 class PoseCommand:
-    """What the page reports after drawing or moving.
+    """Report of the page after drawing a frame or moving the needle.
 
     Parameters
     ----------
@@ -56,7 +52,7 @@ class PoseCommand:
     number : int
         Of this command, ascending.
     sent : float
-        The page's clock, ms; comes back in the frame that shows the command.
+        The page's clock, ms; returned in the frame that shows the command.
     pose : (entry x, entry y, angle, depth) or None
         mm, mm, degrees from +x towards depth, mm; None for a report only.
     """
@@ -68,7 +64,7 @@ class PoseCommand:
 
 
 def encode_command(command: PoseCommand) -> bytes:
-    """Command as bytes (the page's side; used by tests and the load benchmark)."""
+    """Encode a command (the page's side; used by tests and the load benchmark)."""
     flags, pose = (0, (0.0, 0.0, 0.0, 0.0)) if command.pose is None else (HAS_POSE, command.pose)
     return _COMMAND.pack(VERSION, COMMAND, flags, command.drawn, command.number, command.sent, *pose)
 
@@ -79,7 +75,7 @@ def decode_command(data: bytes) -> PoseCommand:
     Raises
     ------
     ProtocolError
-        If length, version, kind, flags or a number is not as it must be.
+        If length, version, kind, flags or a number is invalid.
     """
     if len(data) != COMMAND_BYTES:
         raise ProtocolError(f"a command has {COMMAND_BYTES} bytes; got {len(data)}")
@@ -97,7 +93,7 @@ def decode_command(data: bytes) -> PoseCommand:
 
 
 class SplineLike(Protocol):
-    """What the wire takes from a fitted spline, in conditioned coordinates (x - centre) / scale."""
+    """The part of a fitted spline that is sent, in conditioned coordinates (x - centre) / scale."""
 
     kernel: Any
     landmarks: NDArray[np.float64]
@@ -108,12 +104,12 @@ class SplineLike(Protocol):
 
 
 def encode_frame(snapshot: Snapshot, number: int, *, recording: bool = False, nodes: bool = False) -> bytes:
-    """Frame as bytes.
+    """Encode a frame.
 
     Parameters
     ----------
     snapshot : Snapshot
-        What to show.
+        The scene.
     number : int
         Of the frame, ascending from 1 for each client.
     recording : bool
@@ -203,7 +199,7 @@ SPLINE_HEAD = 12
 
 
 def _spline_bytes(spline: Any) -> tuple[int, bytes]:
-    """Count of landmarks; head, then (x, y, weight x, weight y) per landmark, all in conditioned coordinates."""
+    """Return the number of landmarks and their bytes: head, then (x, y, weight x, weight y) per landmark, all in conditioned coordinates."""
     head = np.zeros(SPLINE_HEAD)
     if spline is None:  # nothing is displaced
         head[[0, 5]] = 1.0
@@ -230,34 +226,34 @@ class _Request(BaseModel):
 
 
 class Reset(_Request):
-    """Needle out, tissue at rest."""
+    """Take the needle out and the tissue to rest."""
 
     do: Literal["reset"]
 
 
 class Freeze(_Request):
-    """Let time stand still, or run."""
+    """Stop model time, or let it run."""
 
     do: Literal["freeze"]
     on: bool
 
 
 class SwitchModel(_Request):
-    """Another model in the same pose."""
+    """Change the model and keep the pose."""
 
     do: Literal["model"]
     name: str = Field(max_length=40)
 
 
 class Compare(_Request):
-    """Step a second model beside the first; null ends it."""
+    """Step a second model with the first; null stops it."""
 
     do: Literal["compare"]
     name: str | None = Field(max_length=40)
 
 
 class StartExercise(_Request):
-    """Reset, place the targets, record."""
+    """Reset, place the targets and record."""
 
     do: Literal["start"]
     exercise: str = Field(max_length=80)

@@ -1,13 +1,12 @@
-"""Scores of a recorded insertion: the metrics that the Perk Tutor made customary, in the imaging plane.
+"""Scores of a recorded insertion: the metrics of the Perk Tutor, in the imaging plane.
 
 Definitions follow PerkTutor/PythonMetrics where it has them: path inefficiency is 100 (path / straight - 1) per
 cent, tissue damage the area that the shaft sweeps inside the tissue, motion smoothness the root of the
-integral of the squared jerk. Unlike there, the target is where the *deformed* tissue has taken it.
+integral of the squared jerk. Unlike there, the target moves with the *deformed* tissue.
 """
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import asdict, dataclass
 from math import inf, isfinite
 
@@ -15,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echospline.errors import InputError
-from echospline.grid import Floats
-from echospline.live import Snapshot
-from echospline.needle import NeedlePose
+from echospline.live import Trace
+from echospline.scene import Floats
 from echospline.viewer.exercise import Exercise
 
 INSIDE = 0.5
@@ -27,139 +25,11 @@ TURN, TURN_REST = 3.0, 0.5
 JERK_INTERVAL = 0.05
 """s; positions are averaged over this long before the third difference is taken, or it would measure
 the rate of the pointer's events instead of the hand."""
-MOST_ROWS, MOST_WATCHED = 2_000_000, 64
-
-
-@dataclass(frozen=True)
-class Trace:
-    """A recorded insertion, one row per step of the engine.
-
-    Parameters
-    ----------
-    period : float
-        s.
-    poses : ndarray, shape (n, 5)
-        entry x, y, tip x, y (mm), speed (mm/s).
-    watched : ndarray, shape (n, k, 2)
-        Deformed positions of target and vessels, mm.
-    """
-
-    period: float
-    poses: Floats
-    watched: Floats
-
-    def __len__(self) -> int:
-        return len(self.poses)
-
-    @property
-    def times(self) -> Floats:
-        """Times after the start, s, shape (n,)."""
-        times: Floats = self.period * np.arange(1, len(self) + 1, dtype=np.float64)
-        return times
-
-    @property
-    def entry(self) -> Floats:
-        """Points of entry, shape (n, 2), mm."""
-        return self.poses[:, 0:2]
-
-    @property
-    def tip(self) -> Floats:
-        """Tips, shape (n, 2), mm."""
-        return self.poses[:, 2:4]
-
-    @property
-    def depth(self) -> Floats:
-        """Insertion depths, shape (n,), mm."""
-        along = self.tip - self.entry
-        depth: Floats = np.hypot(along[:, 0], along[:, 1])
-        return depth
-
-    def pose(self, row: int) -> NeedlePose:
-        """One pose."""
-        x, y, tx, ty, speed = (float(v) for v in self.poses[row])
-        return NeedlePose((x, y), (tx, ty), speed)
-
-    def to_bytes(self) -> bytes:
-        """Compress to bytes for storage."""
-        n, k = len(self), self.watched.shape[1]
-        head = np.array([self.period, n, k], "<f8").tobytes()
-        return head + zlib.compress(
-            np.hstack([self.poses, self.watched.reshape(n, 2 * k)]).astype("<f8").tobytes()
-        )
-
-    @classmethod
-    def from_bytes(cls, data: bytes) -> Trace:
-        """Read what `to_bytes` wrote; sizes are checked before anything is unpacked.
-
-        Raises
-        ------
-        InputError
-            If the bytes are something else.
-        """
-        if len(data) < 24:
-            raise InputError("a stored trace is cut short")
-        period, n, k = np.frombuffer(data[:24], "<f8")
-        if not (isfinite(period) and period > 0 and 0 <= n <= MOST_ROWS and 0 <= k <= MOST_WATCHED):
-            raise InputError("a stored trace has no valid head")
-        size = int(n) * (5 + 2 * int(k)) * 8
-        inflate = zlib.decompressobj()
-        try:
-            content = inflate.decompress(data[24:], size + 1)
-        except zlib.error as error:
-            raise InputError("a stored trace is damaged") from error
-        if len(content) != size or not inflate.eof:
-            raise InputError("a stored trace has another length than its head says")
-        rows = np.frombuffer(content, "<f8").reshape(int(n), 5 + 2 * int(k))
-        if not np.isfinite(rows).all():
-            raise InputError("a stored trace has numbers that are not finite")
-        return cls(float(period), rows[:, :5].copy(), rows[:, 5:].reshape(int(n), int(k), 2).copy())
-
-
-class Recorder:
-    """Collects the rows of a `Trace`; observe an engine with it.
-
-    A reset of the engine begins the recording anew, and frozen time is not recorded. It ends by itself
-    after ``longest`` seconds.
-    """
-
-    def __init__(self, period: float, longest: float) -> None:
-        self.period = period
-        self._most = max(1, round(longest / period))
-        self._time = 0.0
-        self._rows: list[tuple[float, ...]] = []
-        self._watched: list[Floats] = []
-
-    def __call__(self, snapshot: Snapshot) -> None:
-        """Take one snapshot."""
-        if snapshot.time < self._time:
-            self._rows, self._watched = [], []
-        moved, self._time = snapshot.time != self._time, snapshot.time
-        if moved and not self.over:
-            pose = snapshot.pose
-            self._rows.append((*pose.entry, *pose.tip, pose.speed))
-            self._watched.append(snapshot.watched)
-
-    @property
-    def over(self) -> bool:
-        """Whether the time is up."""
-        return len(self._rows) >= self._most
-
-    @property
-    def elapsed(self) -> float:
-        """Recorded so far, s."""
-        return self.period * len(self._rows)
-
-    def trace(self) -> Trace:
-        """Return what was recorded so far."""
-        if not self._rows:
-            return Trace(self.period, np.empty((0, 5)), np.empty((0, 1, 2)))
-        count = min(len(self._rows), len(self._watched))
-        return Trace(self.period, np.array(self._rows[:count]), np.stack(self._watched[:count]))
 
 
 @dataclass(frozen=True)
 class Score:
-    """How an exercise went; lengths mm, times s.
+    """Result of an exercise; lengths mm, times s.
 
     Parameters
     ----------
@@ -170,7 +40,7 @@ class Score:
     tissue_time : float
         With the needle in the tissue.
     path_length : float
-        Way of the tip inside the tissue.
+        Path length of the tip inside the tissue.
     path_inefficiency : float
         100 (path length / straight way from first entry to last tip - 1), per cent.
     tissue_damage : float
@@ -184,7 +54,7 @@ class Score:
     final_error : float
         Last tip to the deformed target's centre.
     target_shift : float
-        How far the tissue has moved the target at the end.
+        Displacement of the target at the end.
     vessel_contacts : int
         Times the needle touched a vessel.
     """
@@ -203,7 +73,7 @@ class Score:
     vessel_contacts: int
 
     def to_dict(self) -> dict[str, float | int | bool | None]:
-        """Plain values for JSON; an infinite one is None."""
+        """Return plain values for JSON; an infinite one is None."""
         return {k: (None if isinstance(v, float) and not isfinite(v) else v) for k, v in asdict(self).items()}
 
 
@@ -249,7 +119,7 @@ def score(trace: Trace, exercise: Exercise) -> Score:
 
 
 def swept_area(trace: Trace) -> Floats:
-    """Area between the shaft of each row and that of the row before, shape (n - 1,), mm^2.
+    """Return the area between the shaft of each row and that of the row before, shape (n - 1,), mm^2.
 
     A needle that only moves along itself sweeps nothing; the two triangles are those of the quadrilateral
     of old and new entry and tip.
@@ -284,7 +154,7 @@ def redirections(trace: Trace, inside: NDArray[np.bool_]) -> int:
 
 
 def contacts(entry: Floats, tip: Floats, centres: Floats, radius: float, inside: NDArray[np.bool_]) -> int:
-    """How often the shaft begins to touch a disc that moves with the tissue."""
+    """Count how often the shaft begins to touch a disc that moves with the tissue."""
     along = tip - entry
     length2 = np.maximum((along**2).sum(axis=1), 1e-12)
     t = np.clip(((centres - entry) * along).sum(axis=1) / length2, 0.0, 1.0)
@@ -293,7 +163,7 @@ def contacts(entry: Floats, tip: Floats, centres: Floats, radius: float, inside:
 
 
 def smoothness(trace: Trace) -> float:
-    """Root of the integral of the squared jerk of the tip, after averaging over `JERK_INTERVAL`."""
+    """Return the root of the integral of the squared jerk of the tip, after averaging over `JERK_INTERVAL`."""
     rows = max(1, round(JERK_INTERVAL / trace.period))
     blocks = len(trace) // rows
     if blocks < 4:

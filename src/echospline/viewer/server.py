@@ -27,11 +27,11 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from echospline.errors import EchosplineError, InputError
-from echospline.needle import NeedlePose
+from echospline.scene import NeedlePose
 from echospline.viewer.client import Client, Seat
 from echospline.viewer.guard import SUBPROTOCOL, Guard
 from echospline.viewer.protocol import COMMAND_BYTES, REQUEST_BYTES
-from echospline.viewer.scene import Scene, SceneOpener, grey_bytes
+from echospline.viewer.served_scene import Scene, SceneOpener, grey_bytes
 from echospline.viewer.sessions import Sessions, sessions_csv, trace_csv
 
 log = logging.getLogger(__name__)
@@ -40,9 +40,9 @@ LOOPBACK = frozenset({"127.0.0.1", "localhost", "::1"})
 UPLOAD_BYTES = 64 * 2**20
 """Largest uploaded file."""
 UPLOADED_SCENES = 8
-"""Uploaded scenes kept; the oldest goes."""
+"""Uploaded scenes kept; the oldest is dropped."""
 PARKED, PARKED_FOR = 8, 60.0
-"""Seats kept after their page went, and for how many seconds: a reload resumes."""
+"""Seats kept after their page has closed, and for how many seconds: a reload resumes."""
 STATIC = Path(str(files("echospline.viewer").joinpath("static")))
 _KEY = re.compile(r"[0-9a-f]{32}")
 _SUFFIX = re.compile(r"(\.[A-Za-z0-9]{1,8}){1,3}$")
@@ -50,20 +50,20 @@ _SUFFIX = re.compile(r"(\.[A-Za-z0-9]{1,8}){1,3}$")
 
 @dataclass(frozen=True)
 class Settings:
-    """How the server is run.
+    """Settings of the server.
 
     Parameters
     ----------
     host : str
-        Address to bind to; other than loopback, a token is asked for.
+        Address to bind to; for an address other than loopback, a token is required.
     port : int
-        0 takes any free one.
+        0 binds any free one.
     rate : float
         Engine steps per second.
     clients : int
         Most pages at once.
     token : str or None
-        What a page must present; made up when the host is not loopback and none is given.
+        Token that a page must present; generated when the host is not loopback and none is given.
     nodes : bool or None
         Send the displacement of every node even where the model is a spline; None decides by the mesh's size.
     """
@@ -86,7 +86,7 @@ class Settings:
 
 @dataclass
 class Room:
-    """What the server remembers while it runs."""
+    """State of the server while it runs."""
 
     scenes: OrderedDict[str, Scene]
     sessions: Sessions
@@ -98,7 +98,7 @@ class Room:
     taken: list[Seat] = field(default_factory=list)
 
     def scene(self, name: str) -> Scene | None:
-        """One scene; the empty name is the one that the server was started with."""
+        """Return a scene; the empty name is the scene that the server was started with."""
         return self.scenes.get(name)
 
     def take_seat(self, key: str, name: str, scene: Scene) -> tuple[Seat, bool]:
@@ -125,18 +125,18 @@ class Room:
 def build_app(
     scene: Scene, sessions: Sessions, settings: Settings | None = None, opener: SceneOpener | None = None
 ) -> Starlette:
-    """ASGI application of the live page.
+    """Build the ASGI application of the live page.
 
     Parameters
     ----------
     scene : Scene
-        What a page shows at first.
+        The first scene of a page.
     sessions : Sessions
-        Where finished exercises are kept.
+        Storage of finished exercises.
     settings : Settings, optional
         Loopback, port 8750.
     opener : callable, optional
-        Makes scenes of uploaded files; without it uploads are refused.
+        Builds scenes from uploaded files; without it uploads are refused.
     """
     settings = settings or Settings()
     room = Room(OrderedDict({"": scene}), sessions, settings, opener)
@@ -161,16 +161,16 @@ def build_app(
 
 
 def steer(app: Starlette, pose: NeedlePose, appears: bool) -> None:
-    """Let a tracker steer the needle of every page that shows the scene the server was started with.
+    """Move the needle of every page that shows the first scene, as a tracker commands.
 
     Parameters
     ----------
     app : Starlette
         From `build_app`.
     pose : NeedlePose
-        Where the needle is.
+        Pose of the needle.
     appears : bool
-        Whether it has just come into sight: then it is put there, not thrust there.
+        Whether tracking of it has just begun: then it is placed there, not pushed there.
     """
     room: Room = app.state.room
     for seat in list(room.taken):
@@ -188,11 +188,11 @@ def serve(
     app : Starlette
         From `build_app` with the same settings.
     settings : Settings
-        Where to listen.
+        Address and port.
     ready : callable
-        Called with the page's address once connections are taken.
+        Called with the page's address once connections are accepted.
     stop : callable
-        Asked ten times a second; true ends the server.
+        Called ten times a second; true stops the server.
 
     Raises
     ------
@@ -293,7 +293,7 @@ def _csv(text: str, name: str) -> Response:
 
 
 async def _upload(request: Request) -> Response:
-    """Take an image file; the same checked readers open it as on the command line."""
+    """Receive an image file; the readers and checks are those of the command line."""
     room = _room(request)
     if room.opener is None:
         return PlainTextResponse("this server takes no uploads", 403)
@@ -301,7 +301,7 @@ async def _upload(request: Request) -> Response:
     if suffix is None:
         return PlainTextResponse("the file's name needs an ending such as .png or .mha", 422)
     spacing = _spacing(request.query_params.get("spacing", ""))
-    if room.uploading.locked():  # one at a time: a picture takes memory while it is read
+    if room.uploading.locked():  # one at a time: reading a picture needs memory
         return PlainTextResponse("another file is being read: try again in a moment", 429)
     async with room.uploading:
         return await _open_upload(request, room, room.opener, suffix.group().lower(), spacing)
@@ -329,7 +329,7 @@ async def _open_upload(
 
 
 def _spacing(text: str) -> tuple[float, float] | None:
-    """Spacing "0.1" or "0.1,0.2" in mm; None where none was given (the file may carry its own)."""
+    """Parse a spacing "0.1" or "0.1,0.2" in mm; None where none was given (the file may carry its own)."""
     if not text:
         return None
     try:

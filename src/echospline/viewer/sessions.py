@@ -16,8 +16,9 @@ from typing import Any
 from pydantic import ValidationError
 
 from echospline.errors import InputError
+from echospline.live import Trace
 from echospline.viewer.exercise import Exercise
-from echospline.viewer.scoring import Score, Trace
+from echospline.viewer.scoring import Score
 
 SCHEMA_VERSION = 1
 _SCHEMA = """
@@ -51,22 +52,22 @@ class Session:
     score: dict[str, Any]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON, without the source."""
+        """Return plain values for JSON, without the source."""
         return {field.name: getattr(self, field.name) for field in fields(self) if field.name != "source"}
 
 
 class Sessions:
-    """A file of sessions; every call opens it anew, so any thread may call and a kill leaves it whole.
+    """A file of sessions; every call opens it anew, so any thread may call and a killed process leaves it whole.
 
     Parameters
     ----------
     path : Path
-        Made with its folder when it does not exist.
+        Created with its folder if missing.
 
     Raises
     ------
     InputError
-        If the file cannot be opened or is something else.
+        If the file cannot be opened or is not such a file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -120,7 +121,7 @@ class Sessions:
             return [_session(row) for row in rows]
 
     def load(self, number: int) -> tuple[Session, Exercise, Trace]:
-        """Read one session whole.
+        """Read one session with its exercise and trace.
 
         Raises
         ------
@@ -156,7 +157,7 @@ def _session(columns: Sequence[Any]) -> Session:
 
 
 def sessions_csv(sessions: list[Session]) -> str:
-    """Sessions as CSV, one row each, oldest first; units are in the header."""
+    """Write sessions as CSV, one row each, oldest first; units are in the header."""
     units = {"time": "s", "tissue_time": "s", "path_length": "mm", "path_inefficiency": "percent",
              "tissue_damage": "mm2", "smoothness": "mm/s^2.5", "final_error": "mm", "target_shift": "mm"}  # fmt: skip
     names = [field.name for field in fields(Score)]
@@ -175,7 +176,7 @@ def sessions_csv(sessions: list[Session]) -> str:
 
 
 def trace_csv(trace: Trace) -> str:
-    """One session's trace as CSV: time, pose and the deformed target, one row per step."""
+    """Write a session's trace as CSV: time, pose and the deformed target, one row per step."""
     out = io.StringIO()
     writer = csv.writer(out)
     writer.writerow(
@@ -188,5 +189,5 @@ def trace_csv(trace: Trace) -> str:
 
 
 def _plain(text: str) -> str:
-    """Text that no spreadsheet takes for a formula."""
+    """Quote text that a spreadsheet would read as a formula."""
     return f"'{text}" if text[:1] in "=+-@\t\r" else text

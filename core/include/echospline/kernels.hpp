@@ -1,0 +1,101 @@
+// Kernels of landmark splines: the field at an offset from a unit weight. Their constants make every kernel positive definite beside held
+// anchors, and 16 pi (8 pi for the thin plate in space) times the fundamental solution, so that a spring of stiffness k adds that over k.
+#pragma once
+#include <cmath>
+#include <type_traits>
+
+#include "lanes.hpp"
+#include "vec.hpp"
+
+namespace echospline::ECHOSPLINE_CORE {
+
+constexpr double PI = 3.14159265358979323846;
+
+ECHOSPLINE_INLINE double logarithm(double x) { return x > 0 ? std::log(x) : 0.0; }
+ECHOSPLINE_INLINE double root(double x) { return std::sqrt(x); }
+
+/// U(r) = r^2 ln r^2 in the plane, equation (3), and -r in space; one scalar serves all components, with the affine motions of equation (5).
+template <int D>
+struct ThinPlate {
+  static constexpr int components = 1;
+  static constexpr int motions = D + 1;              ///< polynomials
+  static constexpr int length_power = D == 2 ? 2 : 1;  ///< of the kernel's values
+  static constexpr double per_spring = D == 2 ? 16 * PI : 8 * PI;
+
+  /// U at an offset, for a scalar or a vector of numbers.
+  template <class Number>
+  ECHOSPLINE_INLINE void at(const Number (&offset)[D], Number (&U)[1][1]) const {
+    Number r2 = offset[0] * offset[0];
+    for (int d = 1; d < D; ++d) r2 += offset[d] * offset[d];
+    if constexpr (D == 2)
+      U[0][0] = r2 * logarithm(r2);
+    else
+      U[0][0] = -root(r2);
+  }
+  /// U at squared distance r2 less U at other2 in the plane, single precision; `less` is the difference of the two. Accurate to the last digits of the difference, where each U is much larger.
+  template <class Number>
+  ECHOSPLINE_INLINE static Number difference(const Number& r2, const Number& other2, const Number& less) {
+    // r2 ln r2 - other2 ln other2 = less ln r2 + other2 ln(r2 / other2), the last logarithm by its series where the ratio is near 1
+    const Number s = less / (r2 + other2 + 1e-30f), z = s * s;
+    const Number series = s * (2.0f + z * (0.66666667f + z * (0.4f + z * (0.28571429f + z * 0.22222222f))));
+    const Number own = logarithm(r2), ratio = pick(z < 0.04f, series, own - logarithm(other2));
+    return less * own + other2 * ratio;
+  }
+  /// Row (1, x, y[, z]) of R at a point.
+  static void motion(const Vec<D>& x, double (&R)[1][motions]) {
+    R[0][0] = 1;
+    for (int d = 0; d < D; ++d) R[0][d + 1] = x[d];
+  }
+};
+
+/// Regularised fundamental solution of elasticity (Kelvin): a matrix couples the components, with the rigid motions. In the plane
+/// -(lap(phi) I - c grad grad(phi)) with phi = s ln s, s = r^2 + radius^2, c = 1 / (2 (1 - nu)) and nu / (1 + nu) for nu in plane stress
+/// (Davis et al. 1997); in space the regularised Kelvinlet (de Goes and James 2017).
+template <int D>
+struct Elastic {
+  static constexpr int components = D;
+  static constexpr int motions = D == 2 ? 3 : 6;
+  static constexpr int length_power = D == 2 ? 0 : -1;
+  static constexpr double per_spring = 16 * PI;
+
+  double coupling;  ///< c in the plane, 1 / (1 - nu) in space
+  double radius2;   ///< square of the regularisation length, in the coordinates of the offsets
+
+  template <class Number>
+  ECHOSPLINE_INLINE void at(const Number (&offset)[D], Number (&U)[D][D]) const {
+    typedef std::remove_cvref_t<decltype(scalar(offset[0]))> Real;
+    const Real c = static_cast<Real>(coupling), e2 = static_cast<Real>(radius2);
+    Number r2 = offset[0] * offset[0];
+    for (int d = 1; d < D; ++d) r2 += offset[d] * offset[d];
+    const Number s = r2 + e2, per = Real(1) / s;
+    if constexpr (D == 2) {
+      const Number own = (Real(2) * c - Real(4)) * (logarithm(s) + Real(1)) - Real(4) * r2 * per, both = Real(4) * c * per;
+      for (int a = 0; a < D; ++a)
+        for (int b = 0; b < D; ++b) U[a][b] = both * offset[a] * offset[b] + (a == b ? own : own * Real(0));
+    } else {
+      const Number p = root(per), p3 = p * per;  // 1 / r_e, 1 / r_e^3
+      const Number own = (Real(4) - c) * p + Real(2) * e2 * p3, both = c * p3;
+      for (int a = 0; a < D; ++a)
+        for (int b = 0; b < D; ++b) U[a][b] = both * offset[a] * offset[b] + (a == b ? own : own * Real(0));
+    }
+  }
+  /// Rigid motions at a point: shifts, then rotations.
+  static void motion(const Vec<D>& x, double (&R)[D][motions]) {
+    for (int a = 0; a < D; ++a)
+      for (int j = 0; j < motions; ++j) R[a][j] = a == j ? 1 : 0;
+    if constexpr (D == 2) {
+      R[0][2] = -x[1], R[1][2] = x[0];
+    } else {
+      R[0][3] = -x[1], R[1][3] = x[0];  // about z
+      R[1][4] = -x[2], R[2][4] = x[1];  // about x
+      R[2][5] = -x[0], R[0][5] = x[2];  // about y
+    }
+  }
+
+ private:
+  static float scalar(Floats);
+  static double scalar(Doubles);
+  static double scalar(double);
+};
+
+}  // namespace echospline::ECHOSPLINE_CORE

@@ -1,0 +1,25 @@
+"""Synthetic ultrasound with known motion: phantoms, speckle statistics, beamforming and image formers."""
+
+from echospline.laboratory.acoustic import channel_data
+from echospline.laboratory.beamform import LinearArray, delay_and_sum
+from echospline.laboratory.needle_field import NeedleField
+from echospline.laboratory.phantom import Displacement, Inclusion, Layer, Phantom, Scatterers
+from echospline.laboratory.phantom_cine import displacement_of, phantom_pictures
+from echospline.laboratory.rescatter import rescatter
+from echospline.laboratory.speckle import speckle_statistics
+
+__all__ = [
+    "Displacement",
+    "Inclusion",
+    "Layer",
+    "LinearArray",
+    "NeedleField",
+    "Phantom",
+    "Scatterers",
+    "channel_data",
+    "delay_and_sum",
+    "displacement_of",
+    "phantom_pictures",
+    "rescatter",
+    "speckle_statistics",
+]

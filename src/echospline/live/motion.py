@@ -1,0 +1,89 @@
+"""Motion of a needle: following its commands, and straight to a pose."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import exp, hypot
+from typing import Any
+
+import numpy as np
+
+from echospline.live.snapshot import Command
+from echospline.mechanics.protocol import TissueModel
+from echospline.scene import ZERO_LENGTH, NeedlePose
+
+ARRIVED = 1e-4
+"""mm; a needle this near to its goal is put exactly there."""
+
+
+def follow(pose: NeedlePose, command: Command, dt: float, lag: float, fastest: float) -> NeedlePose:
+    """Move the needle towards its command as a hand does, without jumps.
+
+    Commands come at the rate of a screen or a tracker, steps at another; applied directly, they would make the speed of (15)
+    flicker between zero and a multiple of the true one. A first-order lag smooths it.
+
+    Parameters
+    ----------
+    pose : NeedlePose
+        Before the step.
+    command : Command
+        The needle's goal.
+    dt : float
+        Length of the step, s.
+    lag : float
+        Time constant, s; 0 goes there at once.
+    fastest : float
+        Upper limit of the speed of tip and entry, mm/s.
+
+    Returns
+    -------
+    NeedlePose
+        After the step; its speed is the axial speed of the tip relative to the entry, mm/s.
+    """
+    share = 1.0 - exp(-dt / lag) if lag > 0 else 1.0
+    entry = _towards(pose.entry, command.entry, share, fastest * dt)
+    tip = _towards(pose.tip, command.tip, share, fastest * dt)
+    moved = NeedlePose(entry, tip)
+    axis = moved.axis if moved.depth > ZERO_LENGTH else pose.axis
+    along = (
+        (tip[0] - entry[0]) - (pose.tip[0] - pose.entry[0]),
+        (tip[1] - entry[1]) - (pose.tip[1] - pose.entry[1]),
+    )
+    return replace(moved, speed=(along[0] * axis[0] + along[1] * axis[1]) / dt)
+
+
+def _towards(
+    start: tuple[float, float], goal: tuple[float, float], share: float, longest: float
+) -> tuple[float, float]:
+    dx, dy = goal[0] - start[0], goal[1] - start[1]
+    distance = hypot(dx, dy)
+    step = min(share * distance, longest)
+    if distance - step < ARRIVED:
+        return goal
+    return (start[0] + dx * step / distance, start[1] + dy * step / distance)
+
+
+def insert_straight(
+    model: TissueModel[Any], pose: NeedlePose, speed: float = 10.0, stride: float = 0.5
+) -> object:
+    """Return the state of a model after a straight insertion to a pose: the first state after a switch of models.
+
+    Parameters
+    ----------
+    model : TissueModel
+        Any model.
+    pose : NeedlePose
+        Pose of the needle.
+    speed : float
+        Of the insertion, mm/s.
+    stride : float
+        Length of one step, mm.
+    """
+    state = model.rest()
+    depth, axis = pose.depth, pose.axis
+    steps = int(np.ceil(depth / stride))
+    for k in range(1, steps + 1):
+        s = depth * k / steps
+        tip = (pose.entry[0] + s * axis[0], pose.entry[1] + s * axis[1])
+        state = model.advance(state, NeedlePose(pose.entry, tip, speed), depth / steps / speed)
+    return state

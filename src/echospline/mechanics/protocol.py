@@ -1,0 +1,40 @@
+"""What every tissue model can do: the one interface that the image side and the outside know."""
+
+from __future__ import annotations
+
+from typing import Generic, Protocol, TypeVar
+
+from numpy.typing import ArrayLike
+
+from echospline.scene import Floats, NeedlePose, RegularGrid
+
+State = TypeVar("State")
+
+
+class TissueModel(Protocol, Generic[State]):
+    """Tissue that answers a needle.
+
+    The state is explicit and never changed in place: ``advance`` returns a new one. All displacements
+    are deformed minus reference, in mm.
+    """
+
+    @property
+    def grid(self) -> RegularGrid:
+        """The mesh whose nodes carry the displacement."""
+        ...
+
+    def rest(self) -> State:
+        """State of tissue that no needle has touched: zero displacement everywhere."""
+        ...
+
+    def advance(self, state: State, pose: NeedlePose, dt: float) -> State:
+        """State after the needle has moved to ``pose`` in ``dt`` seconds (dt >= 0)."""
+        ...
+
+    def displacement(self, state: State) -> Floats:
+        """Displacement of the mesh nodes, shape (n, 2), mm."""
+        ...
+
+    def displacement_at(self, state: State, points: ArrayLike) -> Floats:
+        """Displacement of any reference points (n, 2) in mm, shape (n, 2), mm."""
+        ...

@@ -1,0 +1,22 @@
+"""The picture: deformation field, warped image, needle echo and the simulation loop.
+
+`summary` is imported by its own name: it loads matplotlib.
+"""
+
+from echospline.picture.deformation import Deformation, InverseMap
+from echospline.picture.needle_echo import OUTER_DIAMETER, NeedleEcho, draw_needle
+from echospline.picture.simulate import Frame, ImageFormer, frame_count, simulate
+from echospline.picture.warp import warp
+
+__all__ = [
+    "OUTER_DIAMETER",
+    "Deformation",
+    "Frame",
+    "ImageFormer",
+    "InverseMap",
+    "NeedleEcho",
+    "draw_needle",
+    "frame_count",
+    "simulate",
+    "warp",
+]

@@ -1,0 +1,95 @@
+"""Warp an image: every pixel of the deformed picture takes its value from where it lay in the reference."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+
+from echospline.errors import FoldingError, InputError
+from echospline.picture.deformation import Deformation, InverseMap
+from echospline.scene import Pixels, UltrasoundImage
+
+Interpolation = Literal["linear", "nearest", "cubic"]
+FLAGS = {"linear": cv2.INTER_LINEAR, "nearest": cv2.INTER_NEAREST, "cubic": cv2.INTER_CUBIC}
+NATIVE = (np.uint8, np.uint16, np.int16, np.float32, np.float64)
+"""Types that OpenCV resamples as they are; others go through float64 and come back rounded."""
+
+
+def warp(
+    image: UltrasoundImage,
+    deformation: Deformation | InverseMap,
+    *,
+    border: float | Literal["transparent"] = 0.0,
+    interpolation: Interpolation = "linear",
+    folding: Literal["flag", "refuse"] = "flag",
+) -> UltrasoundImage:
+    """Deform an image.
+
+    Parameters
+    ----------
+    image : UltrasoundImage
+        The reference; type and value range are kept.
+    deformation : Deformation or InverseMap
+        How the tissue moves, or its inverse on the image's grid where the caller has it.
+    border : float or "transparent"
+        Value where no tissue comes to lie, or an alpha channel (the result is RGBA).
+    interpolation : {"linear", "nearest", "cubic"}
+        Between reference pixels; cubic may overshoot, and is cut to the range of the image.
+    folding : {"flag", "refuse"}
+        Whether a deformation that folds is refused; otherwise ``deformation.folds`` says where it does.
+
+    Returns
+    -------
+    UltrasoundImage
+
+    Raises
+    ------
+    FoldingError
+        If the map folds and ``folding="refuse"``.
+    InputError
+        If an option is unknown or the inverse map belongs to another grid.
+    """
+    if interpolation not in FLAGS:
+        raise InputError(f"interpolation is one of {', '.join(FLAGS)}; got {interpolation!r}")
+    if folding not in ("flag", "refuse"):
+        raise InputError(f'folding is "flag" or "refuse"; got {folding!r}')
+    if isinstance(deformation, Deformation):
+        if folding == "refuse" and deformation.folds:
+            raise FoldingError(f"{deformation.folds}: push less far, or allow it with folding flagged")
+        inverse = deformation.inverse(image.grid)
+    else:
+        inverse = deformation
+    if inverse.grid.shape != image.grid.shape:
+        raise InputError(f"the inverse map has grid {inverse.grid.shape}, the image {image.grid.shape}")
+    fill = 0.0 if border == "transparent" else float(border)
+    pixels = _resample(image.pixels, inverse, fill, FLAGS[interpolation])
+    if border == "transparent":
+        pixels = _with_alpha(pixels, inverse)
+    return UltrasoundImage(pixels, image.grid, image.source)
+
+
+def _resample(pixels: Pixels, inverse: InverseMap, fill: float, flag: int) -> Pixels:
+    native = pixels.dtype.type in NATIVE
+    source: Any = np.ascontiguousarray(pixels if native else pixels.astype(np.float64))
+    # half a pixel beyond the outermost centres the tissue is still that of the outermost pixel
+    moved = cv2.remap(source, inverse.x, inverse.y, flag, borderMode=cv2.BORDER_REPLICATE)
+    if not native:
+        if np.issubdtype(pixels.dtype, np.integer):
+            moved = np.rint(moved)
+        moved = moved.astype(pixels.dtype)
+    if flag == cv2.INTER_CUBIC and pixels.size:
+        moved = np.clip(moved, pixels.min(), pixels.max())
+    if inverse.outside.any():
+        moved[inverse.outside] = fill
+    result: Pixels = moved
+    return result
+
+
+def _with_alpha(pixels: Pixels, inverse: InverseMap) -> Pixels:
+    kind: Any = pixels.dtype
+    full = np.iinfo(kind).max if np.issubdtype(kind, np.integer) else 1.0
+    alpha = np.where(inverse.outside, 0, full).astype(pixels.dtype)
+    colour = pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=2)
+    return np.dstack([colour, alpha])

@@ -1,0 +1,21 @@
+"""Scenario files: their tables and messages, and the models that they name.
+
+`run` is imported by its own name: it loads the writers of sequences.
+"""
+
+from echospline.scenario.models import MODELS, build_model
+from echospline.scenario.scenario import LARGEST_FILE, PHANTOM, Scenario, describe, load, validated
+from echospline.scenario.sections import DiscSection, ExerciseSection
+
+__all__ = [
+    "LARGEST_FILE",
+    "MODELS",
+    "PHANTOM",
+    "DiscSection",
+    "ExerciseSection",
+    "Scenario",
+    "build_model",
+    "describe",
+    "load",
+    "validated",
+]

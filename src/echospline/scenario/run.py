@@ -1,0 +1,203 @@
+"""One scenario, one folder of results: cine, true motion, figure, the resolved scenario and a report of the run."""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from echospline.atomic import give_name, part_of
+from echospline.errors import InputError
+from echospline.io import DisplacementWriter, open_writer
+from echospline.io.sequence import SequenceWriter
+from echospline.mechanics.protocol import State, TissueModel
+from echospline.picture import Frame, ImageFormer, frame_count, simulate
+from echospline.scenario.scenario import Scenario
+from echospline.scene import UltrasoundImage
+
+SUFFIX = {
+    "mp4": "cine.mp4", "gif": "cine.gif", "png": "frames", "mha": "cine.mha",
+    "igs.mha": "run.igs.mha", "seq.nrrd": "run.seq.nrrd",
+}  # fmt: skip
+REPORTED_PACKAGES = ("echospline", "numpy", "scipy", "numba", "opencv-python-headless", "scikit-fem", "av")
+"""Packages whose versions are in a report."""
+
+
+@dataclass
+class _Tally:
+    """Counts over the frames of a run."""
+
+    stages: dict[str, list[float]] = field(default_factory=dict)
+    largest: float = 0.0
+    residual: float = 0.0
+    folded: list[dict[str, Any]] = field(default_factory=list)
+
+    def add(self, frame: Frame) -> None:
+        for name, ms in frame.milliseconds.items():
+            self.stages.setdefault(name, []).append(ms)
+        self.largest = max(self.largest, float(np.hypot(*frame.displacement.T).max(initial=0.0)))
+        self.residual = max(self.residual, frame.residual)
+        if frame.folds:
+            self.folded.append({"time_s": round(frame.time, 6), "what": str(frame.folds)})
+
+
+def _sink(
+    name: str, stack: ExitStack, out: Path, image: UltrasoundImage, fps: float
+) -> Callable[[Frame], None]:
+    """Open the writer of one format."""
+    if name in ("igs.mha", "seq.nrrd"):  # for PLUS and 3D Slicer: pictures with the needle's transforms
+        recording = stack.enter_context(SequenceWriter(out / SUFFIX[name], image.grid))
+        return lambda frame: recording.add(frame.image.pixels, frame.time, frame.pose)
+    cine = stack.enter_context(open_writer(out / SUFFIX[name], image.grid, fps))
+    return lambda frame: cine.add(frame.image.pixels, frame.time)
+
+
+def run(
+    scenario: Scenario,
+    image: UltrasoundImage,
+    model: TissueModel[State],
+    out: Path,
+    folder: Path,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+    form_image: ImageFormer | None = None,
+) -> dict[str, Any]:
+    """Simulate a scenario and write its results.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        The scenario.
+    image : UltrasoundImage
+        Its image.
+    model : TissueModel
+        Its model.
+    out : Path
+        Folder for the results; created if missing. Every file gets its name when it is whole.
+    folder : Path
+        Start of the scenario's relative paths.
+    progress : callable, optional
+        Called with (frames done, number of frames).
+    form_image : callable, optional
+        See `simulate`.
+
+    Returns
+    -------
+    dict
+        The content of ``run.json``.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be written.
+    """
+    began = perf_counter()
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot make the folder {out} for the results: {error.strerror}") from error
+    insertion, output = scenario.insertion(), scenario.output
+    count = frame_count(insertion, output.fps)
+    tally, files = _Tally(), []
+    first = shown = deepest = None
+    with ExitStack() as stack:
+        # matrices of a few hundred rows: starting a second thread costs more than it saves
+        stack.enter_context(threadpool_limits(limits=1, user_api="blas"))
+        sinks = []
+        for name in dict.fromkeys(output.formats):
+            files.append(SUFFIX[name])
+            sinks.append(_sink(name, stack, out, image, output.fps))
+        record = None
+        if output.displacement:
+            files.append("displacement.npz")
+            record = stack.enter_context(DisplacementWriter(out / "displacement.npz", model.grid.nodes))
+        for frame in simulate(
+            image,
+            insertion,
+            model,
+            fps=output.fps,
+            longest_step=output.longest_step,
+            border=output.border,
+            folding=output.folding,
+            needle=scenario.needle_echo(),
+            form_image=form_image,
+        ):
+            since = perf_counter()
+            for sink in sinks:
+                sink(frame)
+            if record is not None:
+                record.add(frame.displacement, frame.time, frame.pose)
+            frame.milliseconds["write"] = 1000 * (perf_counter() - since)
+            tally.add(frame)
+            first = first or frame
+            # the figure shows the moment of deepest insertion, the last one before withdrawal or relaxation
+            if deepest is None or (frame.pose.depth >= deepest - 1e-9 and frame.pose.speed > 0):
+                deepest, shown = max(deepest or 0.0, frame.pose.depth), frame
+            if progress is not None:
+                progress(frame.index + 1, count)
+    if output.figure and first is not None and shown is not None:
+        # matplotlib takes longer to load than everything else together: only when a figure is drawn
+        from echospline.picture.summary import summary_figure  # noqa: PLC0415
+
+        title = scenario.title or f"{scenario.model.kind}: needle at {shown.time:.2f} s"
+        summary_figure(
+            first.image,
+            shown.image,
+            model.grid,
+            shown.displacement,
+            shown.pose,
+            out / "summary.png",
+            title=title,
+        )
+        files.append("summary.png")
+    scenario.save(out / "scenario.toml", folder)
+    report = {
+        "made": datetime.now(UTC).isoformat(timespec="seconds"),
+        "image": {
+            "source": image.source,
+            "pixels": list(image.pixels.shape),
+            "spacing_mm": list(image.spacing),
+        },
+        "model": scenario.model.kind,
+        "mesh_nodes": model.grid.size,
+        "frames": count,
+        "largest_displacement_mm": tally.largest,
+        "inverse_map_residual_px": tally.residual,
+        "folded_frames": tally.folded,
+        "milliseconds_per_frame": {
+            name: {
+                "median": float(np.median(ms)),
+                "p99": float(np.percentile(ms, 99)),
+                "total": float(np.sum(ms)),
+            }
+            for name, ms in tally.stages.items()
+        },
+        "seconds": perf_counter() - began,
+        "files": [*files, "scenario.toml", "run.json"],
+        "versions": {"python": platform.python_version(), "platform": platform.platform(), **_versions()},
+        "parameters": scenario.model_dump(mode="json"),
+    }
+    part = part_of(out / "run.json")
+    part.write_text(json.dumps(report, indent=2), encoding="utf-8")
+    give_name(part, out / "run.json")
+    return report
+
+
+def _versions() -> dict[str, str]:
+    found = {}
+    for name in REPORTED_PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found

@@ -1,0 +1,271 @@
+"""A scenario: one commented TOML file that determines a run completely; read, validated and written with all defaults.
+
+The tables and their keys are in `echospline.scenario.sections`.
+"""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import tomlkit
+from pydantic import BaseModel, Field, ValidationError
+
+from echospline.atomic import give_name, part_of
+from echospline.errors import InputError
+from echospline.io import read_image
+from echospline.picture import NeedleEcho
+from echospline.scenario.messages import describe as _describe
+from echospline.scenario.messages import sentence, shown
+from echospline.scenario.phantom_section import PhantomSection, ProbeSection
+from echospline.scenario.sections import (
+    ExerciseSection,
+    ImageSection,
+    MeshSection,
+    ModelSection,
+    NeedleSection,
+    OutputSection,
+    RegionSection,
+    Section,
+    TissueSection,
+)
+from echospline.scene import (
+    Circle,
+    Insertion,
+    Label,
+    Layer,
+    Polygon,
+    Region,
+    RegularGrid,
+    Shape,
+    Tissue,
+    UltrasoundImage,
+)
+
+PHANTOM = "sample:phantom"
+LARGEST_FILE = 1_000_000
+"""Bytes; a scenario is a page of text."""
+
+
+class Scenario(Section):
+    """Complete description of one run.
+
+    Read one with `load`, change it with `with_values`, write it with `save`.
+    """
+
+    format: Literal[1] = Field(1, description="version of this file's layout")
+    title: str = Field("", description="one line for reports")
+    image: ImageSection = ImageSection()
+    tissue: TissueSection = TissueSection()
+    mesh: MeshSection = MeshSection()
+    needle: NeedleSection = NeedleSection()
+    model: ModelSection = ModelSection()
+    output: OutputSection = OutputSection()
+    probe: ProbeSection = ProbeSection()
+    phantom: PhantomSection = PhantomSection()
+    exercise: list[ExerciseSection] = Field(default=[], description="what can be trained live")
+
+    def with_values(self, values: Mapping[str, Any], origin: str = "scenario") -> Scenario:
+        """Return a copy with some keys changed, ``{"needle.depth": 20}``, validated.
+
+        Raises
+        ------
+        InputError
+            If a key is unknown or a value invalid.
+        """
+        tree = self.model_dump(mode="json", exclude_unset=False)
+        for key, value in values.items():
+            *tables, last = key.split(".")
+            table = tree
+            for name in tables:
+                table = table[name]
+            table[last] = value
+        return validated(tree, origin)
+
+    def read_image(self, folder: Path) -> UltrasoundImage:
+        """Read the image; a relative path starts at ``folder``; sample:phantom is [phantom] at rest."""
+        section = self.image
+        if section.file == PHANTOM:
+            return self.phantom.still(self.probe.probe())
+        name = section.file if section.file.startswith("sample:") else str(folder / section.file)
+        return read_image(name, spacing=section.spacing, frame=section.frame, region=section.region)
+
+    def grid(self, image: UltrasoundImage) -> RegularGrid:
+        """Lay the mesh over the image."""
+        return RegularGrid.covering(image.grid, self.mesh.nodes)
+
+    def insertion(self) -> Insertion:
+        """Return the needle's path.
+
+        Raises
+        ------
+        InputError
+            If the speed profile does not ascend to the full depth, or the path's times do not ascend.
+        """
+        n = self.needle
+        if n.path is not None:
+            rows = np.array(n.path)
+            return Insertion(rows[:, 0], rows[:, 1:3], rows[:, 3:5])
+        if isinstance(n.speed, float):
+            return Insertion.straight(
+                n.entry,
+                n.angle,
+                n.depth,
+                n.speed,
+                dwell=n.dwell,
+                retract=n.retract,
+                retract_speed=n.retract_speed,
+            )
+        return _profiled(n, n.speed)
+
+    def needle_echo(self) -> NeedleEcho | None:
+        """Return the needle's looks, or None where it is not drawn."""
+        return NeedleEcho(gauge=self.needle.gauge) if self.output.needle else None
+
+    def make_tissue(self, folder: Path, mesh: RegularGrid) -> Tissue:
+        """Build the tissue with its regions; a labels image is laid over the whole mesh."""
+        t = self.tissue
+        regions = [
+            Region(_shape(r, folder, mesh, f"tissue.region[{i}]"), r.young, r.poisson, r.name)
+            for i, r in enumerate(t.region)
+        ]
+        return Tissue(t.young, t.poisson, regions, t.thickness, t.plane)
+
+    def save(self, path: Path, folder: Path) -> None:
+        """Write the scenario with a comment for every key; relative paths in ``folder`` stay valid from ``path``."""
+        document = tomlkit.document()
+        document.add(
+            tomlkit.comment("echospline scenario: run it with  echospline simulate THIS_FILE --out DIR")
+        )
+        moved = self
+        if not self.image.file.startswith("sample:"):
+            image = os.path.relpath((folder / self.image.file).resolve(), path.parent.resolve())
+            moved = self.model_copy(update={"image": self.image.model_copy(update={"file": image})})
+        _write_section(document, moved)
+        part = part_of(path)
+        part.write_text(tomlkit.dumps(document), encoding="utf-8")
+        give_name(part, path)
+
+
+def load(path: str | Path) -> Scenario:
+    """Read and validate a scenario file.
+
+    Raises
+    ------
+    InputError
+        With the key, the value and the expectation.
+    """
+    path = Path(path)
+    try:
+        size = path.stat().st_size
+        if size > LARGEST_FILE:
+            raise InputError(f"{path} has {size} bytes; a scenario is a TOML file of at most {LARGEST_FILE}")
+        text = path.read_text(encoding="utf-8")
+        tree = tomllib.loads(text)
+    except OSError as error:
+        raise InputError(f"cannot read the scenario {path}: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} is not a TOML file: {error}") from error
+    return validated(tree, str(path))
+
+
+def validated(tree: Mapping[str, Any], origin: str) -> Scenario:
+    """Check a tree of tables and values.
+
+    Raises
+    ------
+    InputError
+        One sentence on the first fault, and the number of others.
+    """
+    try:
+        return Scenario.model_validate(tree)
+    except ValidationError as error:
+        faults = error.errors(include_url=False)
+        more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
+        raise InputError(f"{origin}: {sentence(Scenario, faults[0])}{more}") from None
+
+
+def describe(key: str) -> str:
+    """Describe a key with its range and default: ``describe("needle.depth")``."""
+    return _describe(Scenario, key)
+
+
+def _profiled(n: NeedleSection, profile: Sequence[tuple[float, float]]) -> Insertion:
+    """Turn a speed profile into keyframes."""
+    depths = np.array([0.0, *(row[0] for row in profile)])
+    speeds = np.array([row[1] for row in profile])
+    if not profile or (np.diff(depths) <= 0).any() or (speeds <= 0).any() or abs(depths[-1] - n.depth) > 1e-9:
+        raise InputError(
+            f"needle.speed = {shown(list(profile))}: a profile needs ascending depths that end at the full depth "
+            f"{n.depth:g} mm, and positive speeds in mm/s"
+        )
+    times = np.concatenate([[0.0], np.cumsum(np.diff(depths) / speeds)])
+    axis = np.array([np.cos(np.radians(n.angle)), np.sin(np.radians(n.angle))])
+    if n.dwell > 0:
+        times, depths = np.append(times, times[-1] + n.dwell), np.append(depths, depths[-1])
+    if n.retract:
+        back = n.retract_speed or float(speeds[-1])
+        times, depths = np.append(times, times[-1] + depths[-1] / back), np.append(depths, 0.0)
+    entry = np.array(n.entry)
+    return Insertion(times, entry, entry + depths[:, None] * axis)
+
+
+def _shape(region: RegionSection, folder: Path, mesh: RegularGrid, key: str) -> Shape:
+    given = [name for name in ("layer", "circle", "polygon", "labels") if getattr(region, name) is not None]
+    if len(given) != 1:
+        raise InputError(
+            f"{key}: exactly one of layer, circle, polygon, labels says where it is; got {given or 'none'}"
+        )
+    if region.layer is not None:
+        return Layer(*region.layer)
+    if region.circle is not None:
+        return Circle(region.circle.centre, region.circle.radius)
+    if region.polygon is not None:
+        return Polygon(tuple(region.polygon))
+    if region.labels is None:
+        raise InputError(f"{key} says nothing of where it is")
+    path = folder / region.labels.file
+    labels = read_image(str(path), spacing=(1.0, 1.0)).pixels
+    if labels.ndim != 2 or not np.issubdtype(labels.dtype, np.integer):
+        raise InputError(f"{key}.labels.file = {path}: expected a grey picture of whole numbers")
+    shape = (labels.shape[1], labels.shape[0])
+    return Label(labels.astype(np.int64), RegularGrid.covering(mesh, shape), region.labels.value)
+
+
+def _write_section(table: Any, section: BaseModel) -> None:
+    """Add every key of a section with its description as a comment; sections inside come after plain keys."""
+    inner: list[tuple[str, Any]] = []
+    for name, field in type(section).model_fields.items():
+        value = getattr(section, name)
+        if value is None:
+            continue
+        if isinstance(value, BaseModel) or (
+            isinstance(value, list) and value and isinstance(value[0], BaseModel)
+        ):
+            inner.append((name, value))
+        else:
+            item = tomlkit.item(_as_toml(value))
+            if field.description:
+                item.comment(field.description)
+            table.add(name, item)
+    for name, value in inner:
+        if isinstance(value, BaseModel):
+            sub = tomlkit.table()
+            _write_section(sub, value)
+            table.add(tomlkit.nl())
+            table.add(name, sub)
+        else:
+            rows = tomlkit.aot()
+            for row in value:
+                sub = tomlkit.table()
+                _write_section(sub, row)
+                rows.append(sub)
+            table.add(name, rows)
+
+
+def _as_toml(value: Any) -> Any:
+    return [_as_toml(v) for v in value] if isinstance(value, tuple | list) else value

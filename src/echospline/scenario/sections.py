@@ -1,0 +1,245 @@
+"""The tables of a scenario file: every key with its unit, range, default and meaning.
+
+Numbers are in the project's units (mm, s, mm/s, degrees, N, kPa). A value may carry its unit as text ("25 mm");
+another unit is refused.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+
+from echospline.picture import OUTER_DIAMETER
+
+
+def _in_unit(unit: str) -> BeforeValidator:
+    def strip(value: object) -> object:
+        if not isinstance(value, str):
+            return value
+        number, _, given = value.strip().partition(" ")
+        try:
+            plain = float(number)
+        except ValueError:
+            raise ValueError(f"expected a number in {unit}") from None
+        if given.strip() not in ("", unit):
+            raise ValueError(f"expected a number in {unit}, not in {given.strip()}")
+        return plain
+
+    return BeforeValidator(strip)
+
+
+Millimetres = Annotated[float, _in_unit("mm")]
+Seconds = Annotated[float, _in_unit("s")]
+Degrees = Annotated[float, _in_unit("degrees")]
+Speed = Annotated[float, _in_unit("mm/s")]
+Rate = Annotated[float, _in_unit("1/s")]
+Newtons = Annotated[float, _in_unit("N")]
+Friction = Annotated[float, _in_unit("N s/mm^2")]
+Kilopascals = Annotated[float, _in_unit("kPa")]
+Point = tuple[Millimetres, Millimetres]
+
+
+class Section(BaseModel):
+    """A table of the file: unknown keys are refused, infinite and NaN numbers too."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class ImageSection(Section):
+    """The tissue before the needle."""
+
+    file: str = Field(
+        "sample:calf",
+        description="image, cine or DICOM file, sample:calf, which ships inside, or sample:phantom, made from [phantom]",
+    )
+    spacing: tuple[Annotated[Millimetres, Field(gt=0)], Annotated[Millimetres, Field(gt=0)]] | None = Field(
+        None, description="mm per pixel (lateral, depth); only where the file does not say"
+    )
+    frame: int = Field(0, ge=0, description="frame of a cine, from 0")
+    region: tuple[int, int, int, int] | None = Field(
+        None, description="pixels to keep (left, top, right, bottom), the last two just outside"
+    )
+
+
+class LabelsSection(Section):
+    """Cells of a labels image that make a region."""
+
+    file: str = Field(description="picture of whole numbers, laid over the whole mesh")
+    value: int = Field(description="the number that marks the region")
+
+
+class CircleSection(Section):
+    """A round region."""
+
+    centre: Point = Field(description="mm")
+    radius: Millimetres = Field(gt=0, description="mm")
+
+
+class RegionSection(Section):
+    """Part of the tissue that differs; exactly one of layer, circle, polygon, labels."""
+
+    name: str = Field("", description="for reports")
+    young: Kilopascals = Field(gt=0, description="Young's modulus, kPa")
+    poisson: float = Field(0.45, ge=0, le=0.5, description="Poisson's ratio")
+    layer: tuple[Millimetres, Millimetres] | None = Field(None, description="depths from, to, mm")
+    circle: CircleSection | None = None
+    polygon: list[Point] | None = Field(None, min_length=3, description="corners, mm")
+    labels: LabelsSection | None = None
+
+
+class TissueSection(Section):
+    """Material of the tissue: used by fem and green, and by the elastic kernel for Poisson's ratio."""
+
+    young: Kilopascals = Field(10.0, gt=0, description="Young's modulus of the background, kPa")
+    poisson: float = Field(0.45, ge=0, le=0.5, description="Poisson's ratio of the background")
+    thickness: Millimetres = Field(40.0, gt=0, description="across the imaging plane, mm")
+    plane: Literal["stress", "strain"] = Field("stress", description="plane stress (19) or plane strain")
+    region: list[RegionSection] = Field(
+        default=[], description="layers, lesions; each on top of those before"
+    )
+
+
+class MeshSection(Section):
+    """The mesh over the image and its clamped edges."""
+
+    nodes: tuple[Annotated[int, Field(ge=2, le=4096)], Annotated[int, Field(ge=2, le=4096)]] = Field(
+        (40, 30), description="nodes along x and y, corner to corner over the image"
+    )
+    clamped: list[Literal["top", "bottom", "left", "right"]] = Field(
+        ["left", "right", "bottom"], description="edges held fast; top is the probe's face"
+    )
+    clamped_points: list[Point] = Field(default=[], description="further points held fast, mm")
+
+
+class NeedleSection(Section):
+    """The needle and its path."""
+
+    entry: Point = Field((10.0, 0.0), description="point of entry (x lateral, y depth), mm")
+    angle: Degrees = Field(50.0, ge=-180, le=360, description="degrees: 0 towards +x, 90 straight down")
+    depth: Millimetres = Field(28.0, gt=0, le=500, description="length inserted, mm")
+    speed: Annotated[Speed, Field(gt=0, le=1000)] | list[tuple[Millimetres, Speed]] = Field(
+        8.0, description="mm/s, or a profile [[to depth mm, mm/s], ...] whose last depth is the full depth"
+    )
+    dwell: Seconds = Field(1.5, ge=0, le=3600, description="rest at full depth, s")
+    retract: bool = Field(True, description="pull the needle out again")
+    retract_speed: Annotated[Speed, Field(gt=0, le=1000)] | None = Field(
+        None, description="mm/s; the (last) insertion speed where not given"
+    )
+    path: list[tuple[Seconds, Millimetres, Millimetres, Millimetres, Millimetres]] | None = Field(
+        None,
+        min_length=2,
+        description="in place of all of the above: rows of time, entry x, y, tip x, y (s, mm)",
+    )
+    gauge: int = Field(
+        18, ge=min(OUTER_DIAMETER), le=max(OUTER_DIAMETER), description="gauge, sets the diameter"
+    )
+
+
+class LandmarkSection(Section):
+    """The interaction of tps and elastic: equations (12) to (17)."""
+
+    sigma: Millimetres = Field(1.0, ge=0, le=50, description="push of the tip (12), mm")
+    delta: Millimetres = Field(1.5, ge=0, le=50, description="reach of friction around the shaft (13), mm")
+    alpha1: Seconds = Field(0.08, ge=-10, le=10, description="friction (15), s")
+    alpha2: Seconds = Field(0.04, ge=-10, le=10, description="friction that falls with distance (15), s")
+    alpha3: Rate = Field(1.0, ge=0, le=1e3, description="relaxation (16), 1/s")
+    length: Millimetres = Field(1.0, gt=0, le=100, description="length inside the exponential of (15), mm")
+    drag: float = Field(
+        1.0, ge=0, le=1, description="sideways motion that tissue follows, 0 (paper) to 1 (bonded)"
+    )
+    tip: Literal["point", "node"] = Field("point", description="landmark at the tip, or nearest node (paper)")
+    loading: Literal["follow", "immediate"] = Field(
+        "follow", description="friction grows with the needle's motion, or at once (paper)"
+    )
+    contact_spacing: Millimetres = Field(
+        1.25, ge=0, le=50, description="between contacts, mm; 0 takes every node"
+    )
+    anchor_spacing: Millimetres = Field(1.5, gt=0, le=50, description="between anchors on clamped edges, mm")
+
+
+class ElasticSection(Section):
+    """The elastic kernel."""
+
+    radius: Millimetres = Field(1.0, gt=0, le=50, description="regularisation length, mm")
+    poisson: float | None = Field(
+        None, ge=0, lt=0.5, description="Poisson's ratio; the tissue's where not given"
+    )
+
+
+class GreenSection(Section):
+    """Green's function of tissue under a free surface."""
+
+    radius: Millimetres = Field(0.4, gt=0, le=50, description="length over which a force is spread, mm")
+
+
+class ForceSection(Section):
+    """The needle's forces for fem and green."""
+
+    tip: Newtons = Field(0.4, ge=0, le=100, description="cutting force at the tip, N")
+    friction: Friction = Field(
+        1e-3, ge=0, le=10, description="friction per mm of shaft and mm/s of speed, N s/mm^2 (paper: 1e-8)"
+    )
+    alpha3: Rate = Field(1.0, ge=0, le=1e3, description="relaxation (16), 1/s")
+    ramp: Millimetres = Field(
+        1.0, ge=0, le=100, description="travel over which forces build up, mm; 0 at once"
+    )
+
+
+class ModelSection(Section):
+    """The tissue model."""
+
+    kind: Literal["tps", "elastic", "green", "fem"] = Field("tps", description="tps, elastic, green or fem")
+    landmarks: LandmarkSection = LandmarkSection()
+    elastic: ElasticSection = ElasticSection()
+    green: GreenSection = GreenSection()
+    forces: ForceSection = ForceSection()
+
+
+class OutputSection(Section):
+    """The files to write."""
+
+    fps: float = Field(25.0, gt=0, le=1000, description="frames per second")
+    longest_step: Seconds = Field(1 / 30, gt=0, le=10, description="longest time step of the model, s")
+    formats: list[Literal["mp4", "gif", "png", "mha", "igs.mha", "seq.nrrd"]] = Field(
+        ["mp4"], description="cines: mp4, gif, png, mha; with the needle's transforms: igs.mha, seq.nrrd"
+    )
+    displacement: bool = Field(True, description="write displacement.npz, the true motion")
+    figure: bool = Field(True, description="write summary.png")
+    needle: bool = Field(True, description="draw the needle's echo")
+    border: Annotated[float, Field(ge=0)] | Literal["transparent"] = Field(
+        0.0, description="value where no tissue comes to lie"
+    )
+    folding: Literal["flag", "refuse"] = Field("flag", description="what happens when the picture folds")
+    image_model: Literal["warp", "rescatter"] = Field(
+        "warp",
+        description="warp the picture, or move scatterers as bright as it and image them anew ([probe])",
+    )
+
+
+class DiscSection(Section):
+    """A round structure; it moves with the tissue."""
+
+    centre: Point = Field(description="where it lies at rest (x lateral, y depth), mm")
+    radius: Millimetres = Field(gt=0, le=100, description="mm")
+
+
+class ExerciseSection(Section):
+    """An exercise of the live simulator."""
+
+    name: str = Field(
+        min_length=1, max_length=80, description="short and unique; sessions are listed under it"
+    )
+    title: str = Field(min_length=1, max_length=80, description="for the page")
+    goal: str = Field("", max_length=400, description="one or two sentences for the page")
+    target: DiscSection = Field(
+        description="where the tip shall end; hit inside the radius of the deformed target"
+    )
+    vessels: list[DiscSection] = Field(default=[], max_length=20, description="what the needle may not touch")
+    most_redirections: int | None = Field(None, ge=0, description="turns inside the tissue that are allowed")
+    time_limit: Seconds = Field(120.0, gt=0, le=1800, description="the recording ends by itself, s")
+
+    @property
+    def landmarks(self) -> list[tuple[float, float]]:
+        """Centres of target and vessels at rest, mm: the points watched while the tissue moves."""
+        return [self.target.centre, *(vessel.centre for vessel in self.vessels)]

@@ -1,0 +1,196 @@
+"""Material of the tissue: Young's modulus and Poisson's ratio, region by region."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from echospline.errors import InputError
+from echospline.scene.grid import Floats, RegularGrid, as_points
+
+Mask = NDArray[np.bool_]
+
+
+class Shape(Protocol):
+    """Place of a region."""
+
+    def contains(self, points: Floats) -> Mask:
+        """Test which points (n, 2) in mm belong to the region, shape (n,)."""
+        ...
+
+
+@dataclass(frozen=True)
+class Layer:
+    """Everything between two depths, ``top`` included and ``bottom`` not, mm."""
+
+    top: float
+    bottom: float
+
+    def __post_init__(self) -> None:
+        if not self.top < self.bottom:  # also refuses nan
+            raise InputError(
+                f"a layer's bottom must lie deeper than its top; got {self.top} to {self.bottom} mm"
+            )
+
+    def contains(self, points: Floats) -> Mask:
+        """Test which points lie between the depths."""
+        inside: Mask = (points[:, 1] >= self.top) & (points[:, 1] < self.bottom)
+        return inside
+
+
+@dataclass(frozen=True)
+class Circle:
+    """A round lesion: ``centre`` (x, y) and ``radius`` in mm."""
+
+    centre: tuple[float, float]
+    radius: float
+
+    def __post_init__(self) -> None:
+        as_points(self.centre, "centre of a circle")
+        if not (np.isfinite(self.radius) and self.radius > 0):
+            raise InputError(f"radius of a circle must be a positive number in mm; got {self.radius}")
+
+    def contains(self, points: Floats) -> Mask:
+        """Test which points lie within the radius."""
+        inside: Mask = np.hypot(*(points - self.centre).T) <= self.radius
+        return inside
+
+
+@dataclass(frozen=True)
+class Polygon:
+    """The inside of a closed outline: ``vertices`` (k, 2) in mm, three or more, in order."""
+
+    vertices: tuple[tuple[float, float], ...]
+
+    def __post_init__(self) -> None:
+        if len(as_points(self.vertices, "vertices of a polygon")) < 3:
+            raise InputError(f"a polygon needs three or more vertices; got {len(self.vertices)}")
+
+    def contains(self, points: Floats) -> Mask:
+        """Test which points lie inside, by the parity of edges that a ray along +x crosses."""
+        a = np.asarray(self.vertices, dtype=np.float64)
+        b = np.roll(a, -1, axis=0)
+        x, y = points[:, 0, None], points[:, 1, None]
+        spans = (a[:, 1] > y) != (b[:, 1] > y)
+        rise = np.where(b[:, 1] == a[:, 1], 1.0, b[:, 1] - a[:, 1])
+        crossing = a[:, 0] + (y - a[:, 1]) * (b[:, 0] - a[:, 0]) / rise
+        inside: Mask = (spans & (x < crossing)).sum(axis=1) % 2 == 1
+        return inside
+
+
+@dataclass(frozen=True)
+class Label:
+    """Pixels of a labels image that hold one value: ``labels`` [depth, lateral] of integers on ``grid`` (nearest pixel)."""
+
+    labels: NDArray[np.integer] = field(repr=False)
+    grid: RegularGrid
+    value: int
+
+    def __post_init__(self) -> None:
+        if self.labels.shape != self.grid.shape[::-1] or not np.issubdtype(self.labels.dtype, np.integer):
+            raise InputError(
+                f"labels must be integers of shape {self.grid.shape[::-1]} (rows, columns); "
+                f"got {self.labels.dtype} of {self.labels.shape}"
+            )
+
+    def contains(self, points: Floats) -> Mask:
+        """Test which points have this label; none outside the image."""
+        ix, iy = np.rint(self.grid.to_index(points)).astype(np.intp).T
+        nx, ny = self.grid.shape
+        within = (ix >= 0) & (ix < nx) & (iy >= 0) & (iy < ny)
+        inside: Mask = within & (self.labels[np.clip(iy, 0, ny - 1), np.clip(ix, 0, nx - 1)] == self.value)
+        return inside
+
+
+@dataclass(frozen=True)
+class Region:
+    """Part of the tissue that differs: its shape, Young's modulus (kPa), Poisson's ratio and name."""
+
+    shape: Shape
+    young: float
+    poisson: float = 0.45
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        _check(self.young, self.poisson, f"region {self.name!r}" if self.name else "a region")
+
+
+@dataclass(frozen=True)
+class Tissue:
+    """A slab of tissue, homogeneous but for its regions.
+
+    Parameters
+    ----------
+    young : float
+        Young's modulus E of the background, kPa.
+    poisson : float
+        Poisson's ratio nu of the background.
+    regions : sequence of Region
+        Each lies on top of those before it.
+    thickness : float
+        Across the imaging plane, mm; a force in newtons is spread over it.
+    plane : {"stress", "strain"}
+        "stress" (equation (19)) lets the slab bulge out of the plane, "strain" does not.
+
+    Raises
+    ------
+    InputError
+        If a number is out of its range.
+    """
+
+    young: float = 10.0
+    poisson: float = 0.45
+    regions: Sequence[Region] = ()
+    thickness: float = 40.0
+    plane: Literal["stress", "strain"] = "stress"
+
+    def __post_init__(self) -> None:
+        _check(self.young, self.poisson, "the tissue")
+        if not (np.isfinite(self.thickness) and self.thickness > 0):
+            raise InputError(f"thickness of the tissue must be a positive number in mm; got {self.thickness}")
+        if self.plane not in ("stress", "strain"):
+            raise InputError(f'plane is "stress" or "strain"; got {self.plane!r}')
+        object.__setattr__(self, "regions", tuple(self.regions))
+
+    @property
+    def homogeneous(self) -> bool:
+        """Whether no region differs from the background."""
+        return all((r.young, r.poisson) == (self.young, self.poisson) for r in self.regions)
+
+    def at(self, points: ArrayLike) -> tuple[Floats, Floats]:
+        """Return Young's modulus (kPa) and Poisson's ratio at points (n, 2) in mm, each of shape (n,)."""
+        p = as_points(points)
+        young, poisson = np.full(len(p), float(self.young)), np.full(len(p), float(self.poisson))
+        for region in self.regions:
+            inside = region.shape.contains(p)
+            young[inside], poisson[inside] = region.young, region.poisson
+        return young, poisson
+
+    def in_cells(self, grid: RegularGrid, samples: int = 4) -> tuple[Floats, Floats]:
+        """Return Young's modulus (kPa) and Poisson's ratio per mesh cell, x fastest, each of shape ((nx-1) (ny-1),).
+
+        A cell that a boundary crosses gets the mean over ``samples`` x ``samples`` points, so that a round lesion
+        does not turn into a staircase of whole cells.
+        """
+        nx, ny = grid.shape
+        if self.homogeneous:
+            n = (nx - 1) * (ny - 1)
+            return np.full(n, float(self.young)), np.full(n, float(self.poisson))
+        steps = [(np.arange((n - 1) * samples) + 0.5) / samples for n in (nx, ny)]
+        points = grid.to_mm(np.stack(np.meshgrid(*steps), axis=-1).reshape(-1, 2))
+        young, poisson = (
+            values.reshape(ny - 1, samples, nx - 1, samples).mean(axis=(1, 3)).ravel()
+            for values in self.at(points)
+        )
+        return young, poisson
+
+
+def _check(young: float, poisson: float, owner: str) -> None:
+    if not (np.isfinite(young) and young > 0):
+        raise InputError(f"Young's modulus of {owner} must be a positive number in kPa; got {young}")
+    if not -1 < poisson <= 0.5:
+        raise InputError(f"Poisson's ratio of {owner} must lie in (-1, 0.5]; got {poisson}")

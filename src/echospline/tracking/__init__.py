@@ -1,0 +1,25 @@
+"""Motion measured in cines: trackers, their regions of interest, and tracks on disk."""
+
+from echospline.tracking.block_matching import BlockMatching
+from echospline.tracking.carrier_phase import CarrierPhase
+from echospline.tracking.dense_flow import DenseFlow
+from echospline.tracking.region import grid_over, inside_ahead, region_ahead
+from echospline.tracking.tracker import FlowTracker, Reference, Track, Tracker, grey_pair, track
+from echospline.tracking.tracks import read_track, write_track
+
+__all__ = [
+    "BlockMatching",
+    "CarrierPhase",
+    "DenseFlow",
+    "FlowTracker",
+    "Reference",
+    "Track",
+    "Tracker",
+    "grey_pair",
+    "grid_over",
+    "inside_ahead",
+    "read_track",
+    "region_ahead",
+    "track",
+    "write_track",
+]

@@ -1,0 +1,126 @@
+"""The scene of a page: an image, the models that can deform it, the needle's looks, the exercises."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from math import cos, radians, sin
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from echospline.errors import InputError
+from echospline.live import ModelFactory
+from echospline.picture import NeedleEcho
+from echospline.scene import NeedlePose, RegularGrid, UltrasoundImage
+from echospline.viewer.exercise import Exercise, check_exercises
+
+LARGEST_SIDE = 4096
+"""Pixels; every WebGL2 browser accepts textures of 2048, and nearly all accept this."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One scene, the same for every client.
+
+    Parameters
+    ----------
+    title : str
+        For display.
+    image : UltrasoundImage
+        At rest.
+    grid : RegularGrid
+        The mesh of every model.
+    models : callable
+        From a name to a model.
+    names : tuple of (name, label)
+        The available models; the first one is the default.
+    entry : (x, y)
+        Point of entry, mm.
+    angle : float
+        Its direction, degrees from +x towards depth.
+    echo : NeedleEcho
+        Its looks.
+    exercises : tuple of Exercise
+        The exercises of this scene.
+    source : str
+        Description of the scene's origin, stored with each session so that it can be run again; not read here.
+
+    Raises
+    ------
+    InputError
+        If the image is too large for a browser or an exercise lies outside it.
+    """
+
+    title: str
+    image: UltrasoundImage
+    grid: RegularGrid
+    models: ModelFactory
+    names: tuple[tuple[str, str], ...]
+    entry: tuple[float, float]
+    angle: float = 60.0
+    echo: NeedleEcho = field(default_factory=NeedleEcho)
+    exercises: tuple[Exercise, ...] = ()
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        if max(self.image.grid.shape) > LARGEST_SIDE:
+            raise InputError(
+                f"the live page takes images up to {LARGEST_SIDE} pixels a side; got {self.image.grid.shape}"
+            )
+        if not self.names:
+            raise InputError("a scene needs one model or more")
+        check_exercises(self.exercises, self.grid)
+
+    @property
+    def home(self) -> NeedlePose:
+        """The needle at its entry, outside the tissue."""
+        return NeedlePose(self.entry, self.entry)
+
+    def exercise(self, name: str) -> Exercise | None:
+        """Return the exercise of a name."""
+        return next((exercise for exercise in self.exercises if exercise.name == name), None)
+
+    def describe(self) -> dict[str, Any]:
+        """Return everything that the page needs besides the pixels, as plain values."""
+        (columns, rows), spacing, origin = (
+            self.image.grid.shape,
+            self.image.grid.spacing,
+            self.image.grid.origin,
+        )
+        echo = asdict(self.echo) | {"diameter": self.echo.diameter}
+        return {
+            "title": self.title,
+            "image": {"columns": columns, "rows": rows, "spacing": spacing, "origin": origin},
+            "mesh": {"shape": self.grid.shape, "spacing": self.grid.spacing, "origin": self.grid.origin},
+            "models": [{"name": name, "label": label} for name, label in self.names],
+            "needle": {"entry": self.entry, "angle": self.angle, "echo": echo},
+            "exercises": [exercise.model_dump() for exercise in self.exercises],
+        }
+
+
+SceneOpener = Callable[[Path, tuple[float, float] | None], Scene]
+"""Builds a scene from an uploaded file and a spacing; passed in, because it imports models."""
+
+
+def tip_of(entry: tuple[float, float], angle: float, depth: float) -> tuple[float, float]:
+    """Return the tip of a needle from its entry, mm, direction, degrees, and depth, mm."""
+    if depth == 0.0:
+        return entry
+    return (entry[0] + depth * cos(radians(angle)), entry[1] + depth * sin(radians(angle)))
+
+
+def grey_bytes(image: UltrasoundImage) -> bytes:
+    """Convert pixels to one byte each, row by row: 8-bit unchanged, colour by its brightness, others scaled."""
+    pixels: NDArray[Any] = image.pixels
+    if pixels.ndim == 3:
+        pixels = pixels.astype(np.float64) @ (0.299, 0.587, 0.114)
+        if image.pixels.dtype == np.uint8:
+            return np.rint(pixels).astype(np.uint8).tobytes()
+    if pixels.dtype == np.uint8:
+        return pixels.tobytes()
+    low, high = float(pixels.min()), float(pixels.max())
+    span = high - low if high > low else 1.0
+    return np.rint((pixels.astype(np.float64) - low) * (255.0 / span)).astype(np.uint8).tobytes()
