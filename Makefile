@@ -51,6 +51,10 @@ check: setup core-check
 core-check: setup
 	$(BIN)/clang-format --dry-run --Werror $(NATIVE)
 	$(BIN)/python core/build.py strict
+	@tidy=$$(command -v $(BIN)/clang-tidy clang-tidy | head -n 1); \
+	if [ -n "$$tidy" ]; then echo "$$tidy core/src/*.cpp"; \
+	  "$$tidy" --quiet core/src/*.cpp -- -std=c++20 -fno-exceptions -Wno-psabi; \
+	else echo "clang-tidy is not installed (pip or apt): the core is checked by the compiler's warnings alone"; fi
 
 core-sanitize: setup # the core's own tests under the address and undefined behaviour sanitizers
 	$(BIN)/python core/tests/run.py --sanitize

@@ -146,7 +146,7 @@ class Session {
       require(scene_ && where, "a scene was made of nothing");
       dimension_ = o.dimension, nodes_ = echospline_scene_node_count(scene_);
       require(nodes_ == nodes || nodes == 0, "the scene's nodes are not its shape's");
-      for (int k = 0; k < 3; ++k) origin_[k] = o.origin[k], extent_[k] = o.spacing[k] * (o.shape[k] - 1);
+      for (int k = 0; k < 3; ++k) origin_[k] = o.origin[k], extent_[k] = o.spacing[k] * (o.shape[k] - 1.0);
     }
     const echospline_status made = echospline_tissue_create(given() ? scene_ : nullptr, given() ? &tissue_ : nullptr);
     known(made, echospline_tissue_message(tissue_), tissue_ != nullptr);

@@ -63,7 +63,8 @@ def passes(path: Path, *arguments: str) -> bool:
         f"{'ok  ' if run.returncode == 0 else 'FAIL'} {path.name} {time.monotonic() - begin:.1f} s {run.stdout.strip()}"
     )
     if run.returncode != 0:
-        print(run.stderr[run.stderr.rfind("\r") + 1 :][-8000:])  # the fuzzer writes every seed over the one before
+        before = run.stderr.rfind("\nseed ") + 1  # the fuzzer writes every seed; the last one failed
+        print(run.stderr[before:][-8000:])
     return run.returncode == 0
 
 
