@@ -4,6 +4,9 @@
 //
 // with U the kernel, P its motions and L_B the system (6) of the anchors B alone. A spline through anchors at zero and landmarks C with
 // displacements d is G_:C w with G_CC w = d: no larger than what moves. Factored once per scene.
+//
+// Close to a clamped edge the weights of its anchors are large and of both signs. So that single precision is enough for their field, an anchor's
+// kernel is taken less that of a neighbour, its parent (the nearest one before it); rows of [U P] and L_B are in these differences.
 #pragma once
 #include "array.hpp"
 #include "kernels.hpp"
@@ -62,7 +65,8 @@ inline bool invert(double* A, int64_t n, int64_t ld, int64_t* pivots) {
   return true;
 }
 
-/// G of one set of anchors. Rows of [U P] have all anchors for the first component, then for the next, then the motions.
+/// G of one set of anchors. Rows of [U P] have all anchors for the first component, then for the next, then the motions; the entry of an
+/// anchor is less that of its parent.
 template <int D, class Kernel>
 struct AnchoredKernel {
   static constexpr int c = Kernel::components;
@@ -75,6 +79,7 @@ struct AnchoredKernel {
   int64_t ld;       ///< m rounded up to ROW
   int64_t padded;   ///< b rounded up to ROW
   Array<double> place[D];  ///< conditioned anchors, (padded)
+  Array<int32_t> parent;   ///< of every anchor, before it; -1 for the first
   Array<double> inverse;   ///< L_B^-1, (m, ld)
 
   Vec<D> conditioned(const Vec<D>& p) const { return (1 / scale) * (p - centre); }
@@ -99,6 +104,11 @@ struct AnchoredKernel {
         for (int e = 0; e < c; ++e)
           for (int64_t l = 0; l < count; ++l) out[a * ld + e * anchors + i + l] = U[a][e][l];
     }
+    for (int a = 0; a < c; ++a)
+      for (int e = 0; e < c; ++e) {
+        double* entry = out + a * ld + e * anchors;
+        for (int64_t i = anchors; i-- > 1;) entry[i] -= entry[parent[i]];
+      }
     double R[c][Kernel::motions];
     Kernel::motion(x, R);
     for (int a = 0; a < c; ++a)
@@ -140,7 +150,7 @@ struct AnchoredKernel {
     }
     Array<int64_t> pivots;
     Array<double> row;
-    if (!inverse.reserve(order * ld) || !pivots.reserve(order) || !row.reserve(c * ld)) return no_memory;
+    if (!inverse.reserve(order * ld) || !pivots.reserve(order) || !row.reserve(c * ld) || !find_parents(points)) return no_memory;
     for (int64_t i = 0; i < count; ++i) {
       felt(conditioned(points[i]), row.data());
       for (int a = 0; a < c; ++a) {
@@ -150,10 +160,27 @@ struct AnchoredKernel {
       }
     }
     if (!motions_determined(row)) return not_held;
+    // rows as differences, too
+    for (int64_t a = 0; a < c; ++a)
+      for (int64_t i = count; i-- > 1;) add(&inverse[(a * count + i) * ld], -1, &inverse[(a * count + parent[i]) * ld], ld);
+    for (int64_t j = count * c; j < order; ++j)
+      for (int64_t a = 0; a < c; ++a)
+        for (int64_t i = count; i-- > 1;) inverse[j * ld + a * count + i] -= inverse[j * ld + a * count + parent[i]];
     return invert(inverse.data(), order, ld, pivots.data()) ? ready : not_held;
   }
 
  private:
+  bool find_parents(const Vec<D>* points) {
+    if (!parent.reserve(anchors)) return false;
+    for (int64_t i = 0; i < anchors; ++i) {
+      parent[i] = -1;
+      double least = INFINITY;
+      for (int64_t j = 0; j < i; ++j)
+        if (dot(points[i] - points[j], points[i] - points[j]) < least)
+          least = dot(points[i] - points[j], points[i] - points[j]), parent[i] = static_cast<int32_t>(j);
+    }
+    return true;
+  }
   /// Whether the anchors leave no motion free: the rows of R' are independent (Gram and Schmidt, largest first).
   bool motions_determined(Array<double>& room) {
     constexpr int p = Kernel::motions;

@@ -4,6 +4,7 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <type_traits>
 
 #include "level_begin.hpp"
 
@@ -57,6 +58,26 @@ ECHOSPLINE_INLINE Vector<Real> load(const Real* p) {
 template <class Real>
 ECHOSPLINE_INLINE void store(Real* p, Vector<Real> v) {
   std::memcpy(p, &v, sizeof v);
+}
+typedef float HalfFloats __attribute__((vector_size(WIDTH / 2)));
+/// Numbers of one precision read and written as vectors of another.
+template <class Number>
+ECHOSPLINE_INLINE Vector<Number> load_as(const Number* p) {
+  return load(p);
+}
+template <class Number>
+ECHOSPLINE_INLINE std::enable_if_t<sizeof(Number) == 8, Doubles> load_as(const float* p) {
+  HalfFloats v;
+  std::memcpy(&v, p, sizeof v);
+  return __builtin_convertvector(v, Doubles);
+}
+template <class Number>
+ECHOSPLINE_INLINE void store_as(Number* p, Vector<Number> v) {
+  store(p, v);
+}
+ECHOSPLINE_INLINE void store_as(float* p, Doubles v) {
+  const HalfFloats h = __builtin_convertvector(v, HalfFloats);
+  std::memcpy(p, &h, sizeof h);
 }
 /// Every lane the same number.
 template <class Real>

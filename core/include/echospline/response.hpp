@@ -371,12 +371,15 @@ class Response {
         for (int64_t j = 0; j < count * c; ++j) sum -= held[j * anchored_->ld + i] * w.side(r)[j];
         if (tip)
           for (int a = 0; a < c; ++a) sum -= tip->held[a * anchored_->ld + i] * s[c == 1 ? r : a];
-        if (i >= b * c)
+        if (i >= b * c) {
           weights[(total + i - b * c) * D + r] = sum;
-        else if (c == 1)
-          weights[i * D + r] = sum;
-        else
-          weights[i % b * D + i / b] = sum;
+          continue;
+        }
+        // the weight of a difference is that of the anchor, and less that of its parent, which stands before it
+        const int d = c == 1 ? r : static_cast<int>(i / b);
+        const int64_t anchor = i % b, from = anchored_->parent[anchor];
+        weights[anchor * D + d] = sum;
+        if (from >= 0) weights[from * D + d] -= sum;
       }
     return total;
   }
@@ -452,11 +455,6 @@ class Response {
     int64_t slot;    ///< of a contact, or negative
     int64_t anchor;  ///< or negative
 
-    /// L_B^-1 [U P] of it: a unit vector for an anchor.
-    double held(const Response& own, int component, int64_t i) const {
-      if (slot >= 0) return own.held[(slot * c + component) * own.anchored_->ld + i];
-      return i == component * own.anchored_->anchors + anchor ? 1.0 : 0.0;
-    }
   };
   /// Landmark nearest to a conditioned point.
   Base nearest(const Vec<D>& p) const {
@@ -473,6 +471,17 @@ class Response {
       if (dot(gap, gap) < least) least = dot(gap, gap), base = {at, -1, i};
     }
     return base;
+  }
+  /// L_B^-1 [U P]' of a point less that of a base, (c, ld). That of an anchor is 1 for itself and all its ancestors, for their kernels are
+  /// differences.
+  void subtract_held(const Base& base, double* rows) const {
+    const int64_t ld = anchored_->ld;
+    for (int e = 0; e < c; ++e) {
+      if (base.slot >= 0)
+        add(rows + e * ld, -1, held.data() + (base.slot * c + e) * ld, ld);
+      else
+        for (int64_t i = base.anchor; i >= 0; i = anchored_->parent[i]) rows[e * ld + e * anchored_->anchors + i] -= 1;
+    }
   }
 
   /// Row and column of the last contact in place of those of a slot, and zeros where they were.
@@ -529,11 +538,14 @@ class Response {
 
   typedef Vector<Real> V;
 
-  /// Kernel at one vector of points from a place less from another: U_:p - U_:q.
+  /// Kernel at one vector of points from a tip less from its base: U_:p - U_:q.
   ECHOSPLINE_INLINE void kernel_difference(int64_t at, const Vec<D>& p, const Vec<D>& q, V (&U)[c][c]) const {
     V to_p[D], to_q[D];
-    for (int d = 0; d < D; ++d) to_p[d] = load(points_->x[d].data() + at) - static_cast<Real>(p[d]);
-    for (int d = 0; d < D; ++d) to_q[d] = to_p[d] + static_cast<Real>(p[d] - q[d]);
+    for (int d = 0; d < D; ++d) {
+      const V x = load(points_->x[d].data() + at);
+      const Real near_p = static_cast<Real>(p[d]), near_q = static_cast<Real>(q[d]);  // and what rounding has taken from them
+      to_p[d] = (x - near_p) - static_cast<Real>(p[d] - near_p), to_q[d] = (x - near_q) - static_cast<Real>(q[d] - near_q);
+    }
     if constexpr (by_difference) {
       V r2{}, other2{}, less{};
       for (int d = 0; d < D; ++d) {
@@ -550,34 +562,41 @@ class Response {
     }
   }
 
-  /// Compute the column of a contact that has joined, less its parent's.
+  /// Compute the column of a contact that has joined, less its parent's: it is kept, and what it lacks stays in every field. For the thin
+  /// plate, whose far field is the small rest of large terms, in double.
   void keep_column(int64_t slot, const Base& base) {
-    constexpr int lanes = Lanes<Real>::count;
+    typedef std::conditional_t<c == 1, double, Real> Number;
+    typedef Vector<Number> N;
+    constexpr int lanes = Lanes<Number>::count;
+    constexpr int64_t part = VECTORS * lanes;
     const int64_t ld = anchored_->ld, m = anchored_->order;
-    Real* h = row_weights.data() + room * c * D;
-    for (int64_t i = 0; i < m; ++i)
-      for (int e = 0; e < c; ++e)
-        h[i * c + e] = static_cast<Real>(held[(slot * c + e) * ld + i] - base.held(*this, e, i));
-    for (int64_t b = 0; b < points_->blocks; ++b) {
-      V a[c][planes][VECTORS];
+    double* h = border_.held.data();  // the contact's, which has been stored
+    subtract_held(base, h);
+    for (int64_t first = 0; first < points_->room(); first += part) {
+      const int64_t b = first / block, within = first % block;
+      N a[c][planes][VECTORS];
       for (int v = 0; v < VECTORS; ++v) {
-        V U[c][c];
-        kernel_difference(b * block + v * lanes, place[slot], base.place, U);
+        N to_contact[D], to_base[D], U[c][c], other[c][c];
+        for (int d = 0; d < D; ++d) {
+          const N x = load_as<Number>(points_->x[d].data() + first + v * lanes);
+          to_contact[d] = x - static_cast<Number>(place[slot][d]), to_base[d] = x - static_cast<Number>(base.place[d]);
+        }
+        anchored_->kernel.at(to_contact, U);
+        anchored_->kernel.at(to_base, other);
         for (int e = 0; e < c; ++e)
-          for (int d = 0; d < planes; ++d) a[e][d][v] = U[d][e];
+          for (int d = 0; d < planes; ++d) a[e][d][v] = U[d][e] - other[d][e];
       }
-      const Real* t = table_->values.data() + b * m * c * block;
-      const Real* f = h;
-      for (int64_t i = 0; i < m; ++i, f += c)
+      const Real* t = table_->values.data() + b * m * c * block + within;
+      for (int64_t i = 0; i < m; ++i)
         for (int d = 0; d < planes; ++d, t += block)
           for (int v = 0; v < VECTORS; ++v) {
-            const V value = load(t + v * lanes);
-            for (int e = 0; e < c; ++e) a[e][d][v] -= f[e] * value;
+            const N value = load_as<Number>(t + v * lanes);
+            for (int e = 0; e < c; ++e) a[e][d][v] -= static_cast<Number>(h[e * ld + i]) * value;
           }
-      Real* out = column(b, slot);
+      Real* out = column(b, slot) + within;
       for (int e = 0; e < c; ++e)
         for (int d = 0; d < planes; ++d)
-          for (int v = 0; v < VECTORS; ++v, out += lanes) store(out, a[e][d][v]);
+          for (int v = 0; v < VECTORS; ++v) store_as(out + (e * planes + d) * block + v * lanes, a[e][d][v]);
     }
   }
 
@@ -594,12 +613,16 @@ class Response {
       for (int r = 0; r < Displacements::count; ++r) weight[j * Displacements::count + r] = static_cast<Real>(carried_.side(r)[j]);
     Real s_of[D];
     for (int d = 0; d < D; ++d) s_of[d] = static_cast<Real>(s[d]);
-    if (tip)
+    if (tip) {
+      double* own = border_.held.data();
+      std::memcpy(own, tip->held.data(), static_cast<size_t>(c * anchored_->ld) * sizeof(double));
+      subtract_held(base, own);
       for (int64_t i = 0; i < m; ++i) {
         double sum = 0;
-        for (int e = 0; e < c; ++e) sum += (tip->held[e * anchored_->ld + i] - base.held(*this, e, i)) * (c == 1 ? 1.0 : s[e]);
+        for (int e = 0; e < c; ++e) sum += own[e * anchored_->ld + i] * (c == 1 ? 1.0 : s[e]);
         h[i] = static_cast<Real>(sum);
       }
+    }
     V change{}, reach{};
     for (int64_t b = 0; b < points_->blocks; ++b) {
       V u[D][VECTORS];

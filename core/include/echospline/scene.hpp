@@ -35,12 +35,13 @@ struct Scene {
 
   bool fine() const { return D == 2 && grid.size() > FINE; }
   int64_t sources() const { return source.size(); }
-  /// A landmark's place, conditioned and rounded to the field's precision: kernel and anchors then see the same point, to the last digit.
-  Vec<D> landmark(const Vec<D>& p) const {
-    Vec<D> x = anchored.conditioned(p);
+  /// A source's place, conditioned and rounded to the field's precision, so that a contact stands on its node to the last digit.
+  Vec<D> contact_place(int32_t i) const {
+    Vec<D> x = anchored.conditioned(source[i]);
     for (int d = 0; d < D; ++d) x[d] = static_cast<Real>(x[d]);
     return x;
   }
+
   double softness_at(int64_t node) const { return stiffness.size() ? anchored.softness(stiffness[node]) : 0.0; }
   double softness_near(const Vec<D>& p) const { return stiffness.size() ? softness_at(grid.nearest(p)) : 0.0; }
 

@@ -238,7 +238,7 @@ class Tissue {
       const int32_t source = contacts[j].source;
       wanted_[source] = 0;
       if (response_.slot_of[source] >= 0 || !there) continue;
-      there = response_.join(source, scene.landmark(scene.source[source]), softness_of(source));
+      there = response_.join(source, scene.contact_place(source), softness_of(source));
       ++joined, ++changes;
     }
     if (!there) return not_solved;
@@ -422,7 +422,7 @@ class Tissue {
     const double push = tip_push(p, n.depth, clearance);
     if (kind == leaves) place = before.place;
     step.softness = scene.softness_near(place);
-    response_.meet(scene.landmark(place), tip_column_);
+    response_.meet(scene.anchored.conditioned(place), tip_column_);
     TipLandmark<D>& tip = step.tip;
     tip.place = place;
     if (kind == given) {
@@ -533,7 +533,7 @@ class Tissue {
     clear_beyond(count);
     Weighted weighted{tip.present && on_tip < 0 ? &tip_column_ : nullptr, {}};
     if (weighted.column) {
-      response_.meet(scene.landmark(tip.place), tip_column_);
+      response_.meet(scene.anchored.conditioned(tip.place), tip_column_);
       weighted.s = response_.tip_weight(tip_column_, q_, tip.q, scene.softness_near(tip.place));
     }
     response_.weights(q_, weighted.column, weighted.s, w_);
@@ -567,7 +567,7 @@ class Tissue {
     Step stay = step;
     if (step.tip.present) stay.tip.q = value_before(step.tip.place);
     fill(next_count_, stay, [&](int64_t j) { return next_[j].q; });
-    if (step.has_column()) response_.meet(scene.landmark(step.tip.place), tip_column_);
+    if (step.has_column()) response_.meet(scene.anchored.conditioned(step.tip.place), tip_column_);
     spread(q_, stay, field, rest_field_);
     const double share = largest_share(limit);
     for (int64_t j = 0; j < next_count_; ++j) new_q_[j] = next_[j].q + share * (new_q_[j] - next_[j].q);
@@ -597,10 +597,10 @@ class Tissue {
     Step last;
     last.tip = before, last.on_tip = contact_at(next_, next_count_, before);
     fill(next_count_, last, [&](int64_t j) { return next_[j].q; });
-    response_.meet(scene.landmark(p), tip_column_);
+    response_.meet(scene.anchored.conditioned(p), tip_column_);
     Vec<D> u = response_.at(tip_column_, q_);
     if (!last.has_column()) return u;
-    response_.meet(scene.landmark(before.place), other_column_);
+    response_.meet(scene.anchored.conditioned(before.place), other_column_);
     const Vec<D> s = response_.tip_weight(other_column_, q_, before.q, scene.softness_near(before.place));
     double G[c][c];
     scene.anchored.green(tip_column_.place, tip_column_.felt.data(), other_column_.place, other_column_.held.data(), G);
