@@ -47,10 +47,10 @@ echospline_status check_shape(const echospline_scene_options& o, Message& m) {
   for (int d = 0; d < o.dimension; ++d) {
     if (o.shape[d] < 2)
       return refuse(m, ECHOSPLINE_WRONG_VALUE, "a mesh must have 2 nodes or more along %c; got %d: set shape", axes[d], o.shape[d]);
-    if (!(std::isfinite(o.spacing[d]) && o.spacing[d] > 0))
-      return refuse(m, ECHOSPLINE_WRONG_VALUE, "spacing along %c must be a positive number in mm; got %g", axes[d], o.spacing[d]);
-    if (!std::isfinite(o.origin[d]))
-      return refuse(m, ECHOSPLINE_WRONG_VALUE, "origin along %c must be a finite number in mm; got %g", axes[d], o.origin[d]);
+    if (!(o.spacing[d] >= 1e-6 && o.spacing[d] <= 1e6))  // squares of lengths have to be numbers in single precision, too
+      return refuse(m, ECHOSPLINE_WRONG_VALUE, "spacing along %c must be a number from 1e-06 to 1e+06 mm; got %g", axes[d], o.spacing[d]);
+    if (!(std::fabs(o.origin[d]) < 1e9))
+      return refuse(m, ECHOSPLINE_WRONG_VALUE, "origin along %c must be a finite number in mm, below 1e9; got %g", axes[d], o.origin[d]);
     nodes *= o.shape[d];
     if (nodes > MOST_NODES)
       return refuse(m, ECHOSPLINE_WRONG_SIZE, "a mesh may have %lld nodes; got more: use a coarser one", static_cast<long long>(MOST_NODES));

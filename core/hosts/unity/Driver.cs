@@ -1,0 +1,66 @@
+// Uses Echospline.cs as a Unity script would, without Unity: a push, a stop, a saved state, an error.
+//
+//     mcs -out:driver.exe Driver.cs Echospline.cs && LD_LIBRARY_PATH=<folder of the library> mono driver.exe
+using System;
+using Echospline;
+
+public static class Driver
+{
+    public static int Main()
+    {
+        var options = SceneOptions.Defaults();
+        options.Shape = new Shape(40, 30);
+        options.Spacing = new Point(40.0 / 39, 30.0 / 29);
+        using (var scene = new Scene(options))
+        using (var tissue = new Tissue(scene))
+        using (var other = new Tissue(scene))
+        {
+            var field = new float[2 * scene.NodeCount];
+            var again = new float[2 * scene.NodeCount];
+            var pose = new Pose { Entry = new Point(8, 0), Tip = new Point(9, 1) };
+            var command = new Command { Entry = new Point(8, 0), Tip = new Point(26, 18), Lag = 0.08, Fastest = 20 };
+            for (int step = 0; step < 120; ++step)
+            {
+                pose.Follow(ref command, 0.02);  // FixedUpdate's default
+                tissue.Advance(ref pose);
+                tissue.Displacement(field);
+            }
+            Require(Math.Abs(pose.Tip.X - 26) < 0.5, "the tip arrives");
+            float largest = 0;
+            foreach (var u in field) largest = Math.Max(largest, Math.Abs(u));
+            Require(largest > 0.1 && largest < 20, "the tissue moves");
+
+            other.Load(tissue.Save());
+            other.Displacement(again);
+            for (int i = 0; i < field.Length; ++i) Require(Math.Abs(field[i] - again[i]) < 1e-5, "a saved state comes back");
+            Require(tissue.Landmarks().Length > 0, "landmarks are listed");
+            Require(scene.Anchors().Length > 0 && scene.Sources().Length > 0, "anchors and sources are listed");
+            var at = new double[2];
+            tissue.DisplacementAt(new double[] { pose.Tip.X, pose.Tip.Y }, at);
+            var statistics = tissue.Statistics();
+            Require(statistics.Steps == 120, "steps are counted");
+            Require(statistics.Allocations == 0, "the loop allocates nothing");
+
+            try
+            {
+                tissue.Displacement(new float[3]);
+                Require(false, "a wrong size is refused");
+            }
+            catch (EchosplineException error)
+            {
+                Require(error.Status == Status.WrongSize && error.Message.Length > 0, "a wrong size is refused");
+            }
+            tissue.Reset();
+            tissue.Displacement(field);
+            foreach (var u in field) Require(u == 0, "rest is rest");
+            Console.WriteLine("level {0}, {1} nodes, tip ({2:0.00}, {3:0.00}), displacement {4:0.000} mm at most, {5:0.000} mm at the tip",
+                Core.Name(scene.Level), scene.NodeCount, pose.Tip.X, pose.Tip.Y, largest, Math.Sqrt(at[0] * at[0] + at[1] * at[1]));
+        }
+        return 0;
+    }
+
+    private static void Require(bool right, string what)
+    {
+        if (!right) throw new Exception("expected: " + what);
+    }
+}

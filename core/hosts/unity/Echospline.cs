@@ -1,0 +1,339 @@
+// The core in Unity, or any C# program: scenes, tissues and the motion of a needle over the C interface and nothing else.
+//
+// Put this file into Assets/ and the library (libechospline.so, libechospline.dylib, echospline.dll) into Assets/Plugins/. Structs and
+// enums have the names of echospline.h; there are no defaults here. A Scene is shared by threads, a Tissue belongs to one at a time.
+// `Tissue.Advance` and `Tissue.Displacement` allocate nothing: call them from FixedUpdate, or from a thread of your own.
+using System;
+using System.Runtime.InteropServices;
+
+namespace Echospline
+{
+    public enum Status
+    {
+        Ok = 0, NullPointer = 1, WrongSize = 2, WrongValue = 3, OutOfMemory = 4, NotHeld = 5, NotSolved = 6, WrongState = 7,
+        FailedHandle = 8
+    }
+
+    public enum Level { LevelBest = 0, LevelBaseline = 1, LevelAvx2 = 2, LevelAvx512 = 3, LevelNeon = 4, LevelSimd128 = 5 }
+
+    public enum Kernel { ThinPlate = 0, Elastic = 1 }
+
+    public enum Precision { Single = 0, Double = 1 }
+
+    public enum Tip { TipPoint = 0, TipNode = 1 }
+
+    public enum Loading { Follow = 0, Immediate = 1 }
+
+    public enum Plane { PlaneStress = 0, PlaneStrain = 1 }
+
+    [Flags]
+    public enum Edge : uint { Left = 1, Right = 2, Top = 4, Bottom = 8, Front = 16, Back = 32 }
+
+    public enum LandmarkKind { Contact = 0, Leaving = 1, Tip = 2, TipLeft = 3 }
+
+    /// <summary>Three numbers in mm: lateral, depth, elevation. In the plane the third is not read.</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct Point
+    {
+        public double X, Y, Z;
+
+        public Point(double x, double y, double z = 0) { X = x; Y = y; Z = z; }
+    }
+
+    [StructLayout(LayoutKind.Sequential)]
+    public struct Shape
+    {
+        public int X, Y, Z;
+
+        public Shape(int x, int y, int z = 0) { X = x; Y = y; Z = z; }
+    }
+
+    /// <summary>echospline_scene_options; begin with SceneOptions.Defaults().</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct SceneOptions
+    {
+        public uint StructSize;
+        public int Dimension;
+        public Kernel Kernel;
+        public Precision Precision;
+        public Tip Tip;
+        public Loading Loading;
+        public Plane Plane;
+        public Edge Clamped;
+        public Level Level;
+        public Shape Shape;
+        public Point Spacing;
+        public Point Origin;
+        public double Sigma;
+        public double Delta;
+        public double Alpha1, Alpha2;
+        public double Alpha3;
+        public double Length;
+        public double Drag;
+        public double ContactSpacing;
+        public double AnchorSpacing;
+        public double Poisson;
+        public double Radius;
+        public IntPtr ClampedPoints;
+        public long ClampedPointCount;
+        public IntPtr Stiffness;
+        public long StiffnessCount;
+        public long ContactRoom;
+
+        /// <summary>The core's own defaults; shape and spacing have to be set.</summary>
+        public static SceneOptions Defaults()
+        {
+            var options = new SceneOptions { StructSize = (uint)Marshal.SizeOf(typeof(SceneOptions)) };
+            Native.echospline_scene_defaults(ref options);
+            return options;
+        }
+    }
+
+    /// <summary>echospline_pose.</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct Pose
+    {
+        public Point Entry;
+        public Point Tip;
+        public double Speed;
+        public double Dt;
+
+        /// <summary>Move one step of dt seconds towards a command.</summary>
+        public void Follow(ref Command command, double dt)
+        {
+            var next = new Pose { Dt = dt };
+            var status = Native.echospline_follow(ref this, ref command, ref next);
+            if (status != Status.Ok) throw new EchosplineException(status, Native.Text(Native.echospline_status_text(status)));
+            this = next;
+        }
+    }
+
+    /// <summary>echospline_command.</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct Command
+    {
+        public Point Entry;
+        public Point Tip;
+        public double Lag;
+        public double Fastest;
+    }
+
+    /// <summary>echospline_landmark.</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct Landmark
+    {
+        public Point Place;
+        public Point Displacement;
+        public Point Grip;
+        public double Along;
+        public long Node;
+        public LandmarkKind Kind;
+        public int Reserved;
+    }
+
+    /// <summary>echospline_statistics.</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct Statistics
+    {
+        public uint StructSize;
+        public int Reserved;
+        public long Steps;
+        public long Joined, Left;
+        public long Rebuilt;
+        public long HeldBack;
+        public long Allocations;
+        public double Residual;
+    }
+
+    /// <summary>A call of the core that did not succeed, with the core's sentence.</summary>
+    public sealed class EchosplineException : Exception
+    {
+        public readonly Status Status;
+
+        public EchosplineException(Status status, string message) : base(message) { Status = status; }
+    }
+
+    /// <summary>What is given: mesh, clamped edges, parameters; factored once. Dispose of it after its tissues.</summary>
+    public sealed class Scene : IDisposable
+    {
+        internal IntPtr Handle;
+        public readonly int Dimension;
+
+        public Scene(SceneOptions options)
+        {
+            Core.RequireVersion();
+            Dimension = options.Dimension;
+            var status = Native.echospline_scene_create(ref options, out Handle);
+            if (status == Status.Ok) return;
+            var message = Native.Text(Native.echospline_scene_message(Handle));
+            Dispose();
+            throw new EchosplineException(status, message);
+        }
+
+        public Level Level { get { return Native.echospline_scene_level(Handle); } }
+        public long NodeCount { get { return Native.echospline_scene_node_count(Handle); } }
+
+        /// <summary>Anchors, Dimension numbers each, mm.</summary>
+        public double[] Anchors()
+        {
+            var anchors = new double[Native.echospline_scene_anchor_count(Handle) * Dimension];
+            Check(Native.echospline_scene_anchors(Handle, anchors, anchors.LongLength));
+            return anchors;
+        }
+
+        /// <summary>Mesh nodes that may become contacts, ascending.</summary>
+        public long[] Sources()
+        {
+            var nodes = new long[Native.echospline_scene_source_count(Handle)];
+            Check(Native.echospline_scene_sources(Handle, nodes, nodes.LongLength));
+            return nodes;
+        }
+
+        public void Dispose()
+        {
+            Native.echospline_scene_destroy(Handle);
+            Handle = IntPtr.Zero;
+        }
+
+        private void Check(Status status)
+        {
+            if (status != Status.Ok) throw new EchosplineException(status, Native.Text(Native.echospline_scene_message(Handle)));
+        }
+    }
+
+    /// <summary>One needle's session in a scene.</summary>
+    public sealed class Tissue : IDisposable
+    {
+        private readonly Scene scene;  // lives as long as its tissues
+        private IntPtr handle;
+
+        public Tissue(Scene scene)
+        {
+            this.scene = scene;
+            var status = Native.echospline_tissue_create(scene.Handle, out handle);
+            if (status == Status.Ok) return;
+            var message = Native.Text(Native.echospline_tissue_message(handle));
+            Dispose();
+            throw new EchosplineException(status, message);
+        }
+
+        /// <summary>Back to rest.</summary>
+        public void Reset() { Check(Native.echospline_tissue_reset(handle)); }
+
+        /// <summary>Advance by one step.</summary>
+        public void Advance(ref Pose pose) { Check(Native.echospline_advance(handle, ref pose)); }
+
+        /// <summary>Write the displacement of the mesh nodes, Dimension numbers each, mm.</summary>
+        public void Displacement(double[] field) { Check(Native.echospline_displacement(handle, field, field.LongLength)); }
+
+        /// <summary>The same in single precision.</summary>
+        public void Displacement(float[] field) { Check(Native.echospline_displacement_single(handle, field, field.LongLength)); }
+
+        /// <summary>Write the displacement of reference points, Dimension numbers each, mm.</summary>
+        public void DisplacementAt(double[] points, double[] displacement)
+        {
+            if (displacement.Length != points.Length)
+                throw new ArgumentException("expected room for " + points.Length + " numbers; got " + displacement.Length);
+            Check(Native.echospline_displacement_at(handle, points, points.LongLength / scene.Dimension, displacement));
+        }
+
+        /// <summary>Landmarks that move.</summary>
+        public Landmark[] Landmarks()
+        {
+            long count;
+            Check(Native.echospline_landmarks(handle, null, 0, out count));
+            var landmarks = new Landmark[count];
+            Check(Native.echospline_landmarks(handle, landmarks, count, out count));
+            return landmarks;
+        }
+
+        /// <summary>Counts since the tissue was created.</summary>
+        public Statistics Statistics()
+        {
+            var statistics = new Statistics { StructSize = (uint)Marshal.SizeOf(typeof(Statistics)) };
+            Check(Native.echospline_tissue_statistics(handle, ref statistics));
+            return statistics;
+        }
+
+        /// <summary>The present state as bytes.</summary>
+        public byte[] Save()
+        {
+            var bytes = new byte[Native.echospline_state_size(handle)];
+            Check(Native.echospline_state_save(handle, bytes, bytes.LongLength));
+            return bytes;
+        }
+
+        /// <summary>Make saved bytes the present state.</summary>
+        public void Load(byte[] bytes) { Check(Native.echospline_state_load(handle, bytes, bytes.LongLength)); }
+
+        public void Dispose()
+        {
+            Native.echospline_tissue_destroy(handle);
+            handle = IntPtr.Zero;
+        }
+
+        private void Check(Status status)
+        {
+            if (status != Status.Ok) throw new EchosplineException(status, Native.Text(Native.echospline_tissue_message(handle)));
+        }
+    }
+
+    /// <summary>The library: its version and processor level.</summary>
+    public static class Core
+    {
+        public const uint Version = 0 << 16 | 1 << 8 | 0;  // of the header that this file was written for
+
+        public static Level Best { get { return Native.echospline_level_best(); } }
+
+        public static bool Available(Level level) { return Native.echospline_level_available(level) != 0; }
+
+        public static string Name(Level level) { return Native.Text(Native.echospline_level_name(level)); }
+
+        public static void RequireVersion()
+        {
+            var version = Native.echospline_version();
+            if (version != Version)
+                throw new InvalidOperationException("expected version " + Text(Version) + " of the echospline library; got "
+                    + Text(version) + "; put the library that belongs to Echospline.cs into Plugins/");
+        }
+
+        private static string Text(uint version) { return (version >> 16) + "." + (version >> 8 & 255) + "." + (version & 255); }
+    }
+
+    internal static class Native
+    {
+        private const string Library = "echospline";
+
+        internal static string Text(IntPtr text) { return Marshal.PtrToStringAnsi(text); }
+
+        [DllImport(Library)] internal static extern IntPtr echospline_status_text(Status status);
+        [DllImport(Library)] internal static extern uint echospline_version();
+        [DllImport(Library)] internal static extern Level echospline_level_best();
+        [DllImport(Library)] internal static extern int echospline_level_available(Level level);
+        [DllImport(Library)] internal static extern IntPtr echospline_level_name(Level level);
+        [DllImport(Library)] internal static extern void echospline_scene_defaults(ref SceneOptions options);
+        [DllImport(Library)] internal static extern Status echospline_scene_create(ref SceneOptions options, out IntPtr scene);
+        [DllImport(Library)] internal static extern void echospline_scene_destroy(IntPtr scene);
+        [DllImport(Library)] internal static extern IntPtr echospline_scene_message(IntPtr scene);
+        [DllImport(Library)] internal static extern Level echospline_scene_level(IntPtr scene);
+        [DllImport(Library)] internal static extern long echospline_scene_node_count(IntPtr scene);
+        [DllImport(Library)] internal static extern long echospline_scene_anchor_count(IntPtr scene);
+        [DllImport(Library)] internal static extern long echospline_scene_source_count(IntPtr scene);
+        [DllImport(Library)] internal static extern Status echospline_scene_anchors(IntPtr scene, double[] anchors, long count);
+        [DllImport(Library)] internal static extern Status echospline_scene_sources(IntPtr scene, long[] nodes, long count);
+        [DllImport(Library)] internal static extern Status echospline_follow(ref Pose now, ref Command command, ref Pose next);
+        [DllImport(Library)] internal static extern Status echospline_tissue_create(IntPtr scene, out IntPtr tissue);
+        [DllImport(Library)] internal static extern void echospline_tissue_destroy(IntPtr tissue);
+        [DllImport(Library)] internal static extern IntPtr echospline_tissue_message(IntPtr tissue);
+        [DllImport(Library)] internal static extern Status echospline_tissue_reset(IntPtr tissue);
+        [DllImport(Library)] internal static extern Status echospline_advance(IntPtr tissue, ref Pose pose);
+        [DllImport(Library)] internal static extern Status echospline_displacement(IntPtr tissue, double[] displacement, long count);
+        [DllImport(Library)] internal static extern Status echospline_displacement_single(IntPtr tissue, float[] displacement, long count);
+        [DllImport(Library)] internal static extern Status echospline_displacement_at(IntPtr tissue, double[] points, long point_count, [Out] double[] displacement);
+        [DllImport(Library)] internal static extern Status echospline_landmarks(IntPtr tissue, [Out] Landmark[] landmarks, long room, out long count);
+        [DllImport(Library)] internal static extern Status echospline_tissue_statistics(IntPtr tissue, ref Statistics statistics);
+        [DllImport(Library)] internal static extern long echospline_state_size(IntPtr tissue);
+        [DllImport(Library)] internal static extern Status echospline_state_save(IntPtr tissue, [Out] byte[] bytes, long size);
+        [DllImport(Library)] internal static extern Status echospline_state_load(IntPtr tissue, byte[] bytes, long size);
+    }
+}

@@ -1,0 +1,332 @@
+// Misuse of the C interface by random bytes: wrong sizes, numbers that are not finite, NULL, calls in any order, damaged states.
+//
+// Whatever comes, a call returns a status that the header knows, a failed call leaves a message, and a displacement that is
+// handed out is finite. Sanitizers see the rest. With clang it is a libFuzzer target; elsewhere `main` below draws the bytes:
+//
+//     fuzz SECONDS [SEED]
+#include <chrono>
+#include <cmath>
+#include <cstdint>
+#include <cstdio>
+#include <cstdlib>
+#include <cstring>
+#include <limits>
+#include <vector>
+
+#include "echospline/echospline.h"
+
+namespace {
+
+void require(bool right, const char* what) {
+  if (right) return;
+  std::fprintf(stderr, "fuzz: %s\n", what);
+  std::abort();
+}
+
+/// Choices made from the input; zeros when it has ended.
+class Choices {
+ public:
+  Choices(const uint8_t* data, size_t size) : data_(data), size_(size) {}
+  bool ended() const { return at_ >= size_; }
+  uint8_t byte() { return at_ < size_ ? data_[at_++] : 0; }
+  /// One of `count`.
+  int below(int count) { return byte() % count; }
+  bool rarely() { return byte() > 245; }
+  /// A number in [low, high], or one that nobody should pass.
+  double number(double low, double high) {
+    static const double wrong[] = {std::nan(""), INFINITY, -INFINITY, 0.0, -1.0, 1e308, -1e308, 5e-324, 1e-30, 1e30};
+    if (rarely()) return wrong[below(10)];
+    return low + (high - low) * (byte() * 256 + byte()) / 65535.0;
+  }
+  int32_t whole(int32_t low, int32_t high) {
+    static const int32_t wrong[] = {0, -1, 1, 2, 99, INT32_MAX, INT32_MIN};
+    return rarely() ? wrong[below(7)] : low + below(high - low + 1);
+  }
+  int64_t size(int64_t right) {
+    const int64_t wrong[] = {0, -1, right - 1, right + 1, INT64_MIN};
+    return rarely() ? wrong[below(5)] : right;
+  }
+
+ private:
+  const uint8_t* data_;
+  size_t size_, at_ = 0;
+};
+
+/// One scene, its tissues' handles, and what was saved.
+class Session {
+ public:
+  explicit Session(Choices& choices) : choices_(choices) {}
+  ~Session() { leave(); }
+
+  void act() {
+    switch (choices_.below(20)) {
+      case 0: open(); break;
+      case 1: reset(); break;
+      case 2:
+      case 3: read(); break;
+      case 4: read_at(); break;
+      case 5: landmarks(); break;
+      case 6: statistics(); break;
+      case 7:
+      case 8: save(); break;
+      case 9:
+      case 10: load(); break;
+      case 11: getters(); break;
+      case 12: follow(); break;
+      case 13: nothing(); break;
+      default: advance(); break;
+    }
+  }
+
+ private:
+  bool given() { return !choices_.rarely(); }
+  echospline_tissue* tissue() { return given() ? tissue_ : nullptr; }
+
+  void known(echospline_status status, const char* message, bool has_handle) {
+    require(status >= ECHOSPLINE_OK && status <= ECHOSPLINE_FAILED_HANDLE, "a status that the header does not know");
+    require(std::strcmp(echospline_status_text(status), "unknown status") != 0, "a status without a name");
+    if (status != ECHOSPLINE_OK && has_handle) require(message && *message, "a failure without a message");
+  }
+  echospline_status result_of(echospline_tissue* tissue, echospline_status status) {
+    known(status, echospline_tissue_message(tissue), tissue != nullptr);
+    if (!tissue) require(status != ECHOSPLINE_OK, "NULL was taken for a tissue");
+    return status;
+  }
+
+  void open() {
+    leave();
+    echospline_scene_options o;
+    std::memset(&o, 0, sizeof o);
+    o.struct_size = static_cast<uint32_t>(choices_.size(sizeof o));
+    if (choices_.rarely()) o.struct_size = choices_.byte();
+    echospline_scene_defaults(&o);
+    o.struct_size = choices_.rarely() ? choices_.byte() : sizeof o;
+    o.dimension = choices_.whole(2, 3);
+    o.kernel = choices_.whole(0, 1);
+    o.precision = choices_.whole(0, 1);
+    o.tip = choices_.whole(0, 1);
+    o.loading = choices_.whole(0, 1);
+    o.plane = choices_.whole(0, 1);
+    if (choices_.below(4) == 0) o.clamped = choices_.byte();
+    o.level = choices_.below(4) == 0 ? choices_.whole(0, 5) : ECHOSPLINE_LEVEL_BEST;
+    const int32_t most = o.dimension == 3 ? 6 : 17;
+    for (int k = 0; k < 3; ++k) {
+      o.shape[k] = choices_.whole(2, most);
+      o.spacing[k] = choices_.number(0.5, 3);
+      if (choices_.below(4) == 0) o.origin[k] = choices_.number(-20, 20);
+    }
+    o.anchor_spacing = choices_.number(2, 9);
+    double* numbers[] = {&o.sigma,  &o.delta, &o.alpha1,          &o.alpha2, &o.alpha3,
+                         &o.length, &o.drag,  &o.contact_spacing, &o.radius};
+    for (double* number : numbers)
+      if (choices_.below(8) == 0) *number = choices_.number(0, 2);
+    if (choices_.below(8) == 0) o.poisson = choices_.number(0, 0.5);
+    o.contact_room = choices_.below(8) == 0 ? choices_.whole(0, 8) : 0;
+    double points[6], *stiffness = nullptr;
+    if (choices_.below(4) == 0) {
+      for (double& x : points) x = choices_.number(0, 20);
+      o.clamped_points = given() ? points : nullptr;
+      o.clamped_point_count = choices_.below(3);
+    }
+    int64_t nodes = 1;  // 0: a shape that has to be refused, or one too large to give every node a stiffness
+    for (int k = 0; k < (o.dimension == 3 ? 3 : 2); ++k) nodes *= o.shape[k] > 1 && o.shape[k] < 100 ? o.shape[k] : 0;
+    if (nodes && choices_.below(4) == 0) {
+      stiffness = static_cast<double*>(std::malloc(nodes * sizeof(double)));
+      for (int64_t i = 0; i < nodes; ++i) stiffness[i] = 0.5 + i % 3;
+      stiffness[choices_.byte() % nodes] = choices_.number(0.1, 10);
+      o.stiffness = stiffness;
+      o.stiffness_count = nodes;
+      if (choices_.rarely()) o.stiffness_count = choices_.below(2);  // never more than there are
+    }
+    echospline_scene** where = given() ? &scene_ : nullptr;
+    const echospline_status status = echospline_scene_create(given() ? &o : nullptr, where);
+    known(status, echospline_scene_message(scene_), scene_ != nullptr);
+    std::free(stiffness);
+    if (status == ECHOSPLINE_OK) {
+      require(scene_ && where, "a scene was made of nothing");
+      dimension_ = o.dimension, nodes_ = echospline_scene_node_count(scene_);
+      require(nodes_ == nodes || nodes == 0, "the scene's nodes are not its shape's");
+      for (int k = 0; k < 3; ++k) origin_[k] = o.origin[k], extent_[k] = o.spacing[k] * (o.shape[k] - 1.0);
+    }
+    const echospline_status made = echospline_tissue_create(given() ? scene_ : nullptr, given() ? &tissue_ : nullptr);
+    known(made, echospline_tissue_message(tissue_), tissue_ != nullptr);
+    if (status != ECHOSPLINE_OK) require(made != ECHOSPLINE_OK, "a tissue was made in a failed scene");
+    good_ = made == ECHOSPLINE_OK;
+  }
+
+  void leave() {
+    echospline_tissue_destroy(tissue_);
+    echospline_scene_destroy(scene_);
+    tissue_ = nullptr, scene_ = nullptr, good_ = false, nodes_ = 0;
+  }
+
+  double place(int k, double low, double high) { return origin_[k] + extent_[k] * choices_.number(low, high); }
+
+  void advance() {
+    if (choices_.below(4) == 0) entry_[0] = place(0, 0.2, 0.8), entry_[1] = origin_[1], entry_[2] = place(2, 0.3, 0.7);
+    echospline_pose pose;
+    for (int k = 0; k < 3; ++k) pose.entry[k] = entry_[k], pose.tip[k] = place(k, k == 1 ? -0.1 : 0.1, 0.9);
+    pose.speed = choices_.number(-10, 10);
+    pose.dt = choices_.number(0, 0.1);
+    echospline_tissue* t = tissue();
+    const echospline_status status = result_of(t, echospline_advance(t, given() ? &pose : nullptr));
+    if (status != ECHOSPLINE_OK && good_) read();
+  }
+
+  void reset() {
+    echospline_tissue* t = tissue();
+    result_of(t, echospline_tissue_reset(t));
+  }
+
+  void read() {
+    const int64_t right = nodes_ * dimension_, count = choices_.size(right);
+    echospline_tissue* t = tissue();
+    if (choices_.below(2)) {
+      std::vector<float> field(right);
+      if (result_of(t, echospline_displacement_single(t, given() ? field.data() : nullptr, count)) == ECHOSPLINE_OK)
+        for (float u : field) require(std::isfinite(u), "a displacement that is not finite");
+    } else {
+      std::vector<double> field(right);
+      if (result_of(t, echospline_displacement(t, given() ? field.data() : nullptr, count)) == ECHOSPLINE_OK)
+        for (double u : field) require(std::isfinite(u), "a displacement that is not finite");
+    }
+  }
+
+  void read_at() {
+    double points[9], field[9];
+    for (int i = 0; i < 9; ++i) points[i] = place(i % dimension_, -1, 2);
+    const int64_t wrong[] = {-1, INT64_MIN, INT64_MAX},
+                  count = choices_.rarely() ? wrong[choices_.below(2)] : choices_.below(4);
+    echospline_tissue* t = tissue();
+    if (result_of(t, echospline_displacement_at(t, given() ? points : nullptr, count, given() ? field : nullptr)) ==
+        ECHOSPLINE_OK)
+      for (int64_t i = 0; i < count * dimension_; ++i)
+        require(std::isfinite(field[i]), "a displacement that is not finite");
+  }
+
+  void landmarks() {
+    const int64_t room = choices_.below(40), given_room = choices_.rarely() ? -1 : room;
+    std::vector<echospline_landmark> list(room);
+    int64_t count = 0;
+    echospline_tissue* t = tissue();
+    result_of(t, echospline_landmarks(t, given() ? list.data() : nullptr, given_room, given() ? &count : nullptr));
+    require(count >= 0, "a negative number of landmarks");
+  }
+
+  void statistics() {
+    echospline_statistics s;
+    std::memset(&s, 0, sizeof s);
+    s.struct_size = static_cast<uint32_t>(choices_.size(sizeof s));
+    if (choices_.rarely()) s.struct_size = choices_.byte() % (sizeof s + 1);
+    if (s.struct_size > sizeof s + 8) s.struct_size = 0;
+    echospline_tissue* t = tissue();
+    result_of(t, echospline_tissue_statistics(t, given() ? &s : nullptr));
+  }
+
+  void save() {
+    echospline_tissue* t = tissue();
+    const int64_t size = echospline_state_size(t);
+    require(size >= 0 && size < (1 << 24), "the size of a state");
+    const int64_t room = choices_.size(size);
+    std::vector<uint8_t> bytes(size);
+    if (result_of(t, echospline_state_save(t, given() ? bytes.data() : nullptr, room)) == ECHOSPLINE_OK && size <= room)
+      saved_ = bytes;
+  }
+
+  void load() {
+    if (saved_.empty()) return;
+    std::vector<uint8_t> bytes = saved_;
+    for (int n = choices_.below(3); n > 0; --n)
+      bytes[(choices_.byte() * 256 + choices_.byte()) % bytes.size()] ^= 1 << choices_.below(8);
+    if (choices_.below(6) == 0) bytes.resize(bytes.size() * choices_.byte() / 256);
+    if (choices_.rarely()) bytes.resize(bytes.size() + choices_.byte());
+    echospline_tissue* t = tissue();
+    result_of(
+        t, echospline_state_load(t, given() ? bytes.data() : nullptr, choices_.rarely() ? -1 : int64_t(bytes.size())));
+    if (good_) read();
+  }
+
+  void getters() {
+    echospline_scene* scene = given() ? scene_ : nullptr;
+    const int64_t anchors = echospline_scene_anchor_count(scene), sources = echospline_scene_source_count(scene);
+    require(anchors >= 0 && sources >= 0 && echospline_scene_node_count(scene) >= 0, "a negative count");
+    require(echospline_level_name(echospline_scene_level(scene)) != nullptr, "a level without a name");
+    std::vector<double> places(anchors * 3);
+    std::vector<int64_t> nodes(sources);
+    known(echospline_scene_anchors(scene, given() ? places.data() : nullptr, choices_.size(anchors * dimension_)),
+          echospline_scene_message(scene), scene != nullptr);
+    known(echospline_scene_sources(scene, given() ? nodes.data() : nullptr, choices_.size(sources)),
+          echospline_scene_message(scene), scene != nullptr);
+  }
+
+  void follow() {
+    echospline_pose now, next;
+    echospline_command command;
+    for (int k = 0; k < 3; ++k) {
+      now.entry[k] = choices_.number(0, 20), now.tip[k] = choices_.number(0, 20);
+      command.entry[k] = choices_.number(0, 20), command.tip[k] = choices_.number(0, 20);
+    }
+    now.speed = 0, now.dt = 0;
+    command.lag = choices_.number(0, 1), command.fastest = choices_.number(0, 50);
+    next.dt = choices_.number(0, 0.1);
+    known(echospline_follow(given() ? &now : nullptr, given() ? &command : nullptr, given() ? &next : nullptr), nullptr,
+          false);
+  }
+
+  void nothing() {
+    echospline_tissue_destroy(nullptr);
+    echospline_scene_destroy(nullptr);
+    echospline_scene_defaults(nullptr);
+    echospline_scene_message(nullptr);
+    echospline_tissue_message(nullptr);
+    const int32_t any = choices_.whole(-3, 9);
+    require(echospline_status_text(any) && echospline_level_name(any), "a text that is NULL");
+    require(echospline_level_available(any) == 0 || (any >= 0 && any <= 5), "a level that the header does not know");
+    require(echospline_level_available(echospline_level_best()) == 1, "the best level is not available");
+  }
+
+  Choices& choices_;
+  echospline_scene* scene_ = nullptr;
+  echospline_tissue* tissue_ = nullptr;
+  bool good_ = false;
+  int64_t nodes_ = 0;
+  int dimension_ = 2;
+  double origin_[3] = {0, 0, 0}, extent_[3] = {10, 10, 10}, entry_[3] = {5, 0, 5};
+  std::vector<uint8_t> saved_;  // lives longer than its scene: a state of another scene has to be refused
+};
+
+}  // namespace
+
+extern "C" int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
+  Choices choices(data, size);
+  Session session(choices);
+  while (!choices.ended()) session.act();
+  return 0;
+}
+
+#ifndef ECHOSPLINE_LIBFUZZER
+int main(int count, char** arguments) {
+  const double seconds = count > 1 ? std::atof(arguments[1]) : 10;
+  const uint64_t first = count > 2 ? std::strtoull(arguments[2], nullptr, 10) : 1;
+  uint64_t seed = first;
+  const auto begin = std::chrono::steady_clock::now();
+  std::vector<uint8_t> bytes;
+  while (std::chrono::duration<double>(std::chrono::steady_clock::now() - begin).count() < seconds) {
+    uint64_t state = seed * 0x9e3779b97f4a7c15u + 1;
+    bytes.resize(64 + seed % 4032);
+    for (uint8_t& byte : bytes) {  // xorshift
+      state ^= state << 13, state ^= state >> 7, state ^= state << 17;
+      byte = static_cast<uint8_t>(state >> 32);
+    }
+    bytes[0] = 0;  // begin with a scene
+    std::fprintf(stderr, "\rseed %llu",
+                 static_cast<unsigned long long>(seed));  // the last one seen is the one that failed
+    LLVMFuzzerTestOneInput(bytes.data(), bytes.size());
+    ++seed;
+  }
+  std::fprintf(stderr, "\n");
+  std::printf("fuzz: %llu sessions from seed %llu in %.0f s, nothing found\n",
+              static_cast<unsigned long long>(seed - first), static_cast<unsigned long long>(first), seconds);
+  return 0;
+}
+#endif

@@ -1,0 +1,122 @@
+/* The C interface is pinned: the header compiles as C17 and as C++20, and sizes, offsets and enum values never change unnoticed. */
+#include "echospline/echospline.h"
+
+#include <assert.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <stdio.h>
+
+#define VALUE(name, value) static_assert((int)ECHOSPLINE_##name == value, #name)
+
+VALUE(OK, 0);
+VALUE(NULL_POINTER, 1);
+VALUE(WRONG_SIZE, 2);
+VALUE(WRONG_VALUE, 3);
+VALUE(OUT_OF_MEMORY, 4);
+VALUE(NOT_HELD, 5);
+VALUE(NOT_SOLVED, 6);
+VALUE(WRONG_STATE, 7);
+VALUE(FAILED_HANDLE, 8);
+VALUE(LEVEL_BEST, 0);
+VALUE(LEVEL_BASELINE, 1);
+VALUE(LEVEL_AVX2, 2);
+VALUE(LEVEL_AVX512, 3);
+VALUE(LEVEL_NEON, 4);
+VALUE(LEVEL_SIMD128, 5);
+VALUE(THIN_PLATE, 0);
+VALUE(ELASTIC, 1);
+VALUE(SINGLE, 0);
+VALUE(DOUBLE, 1);
+VALUE(TIP_POINT, 0);
+VALUE(TIP_NODE, 1);
+VALUE(FOLLOW, 0);
+VALUE(IMMEDIATE, 1);
+VALUE(PLANE_STRESS, 0);
+VALUE(PLANE_STRAIN, 1);
+VALUE(LEFT, 1);
+VALUE(RIGHT, 2);
+VALUE(TOP, 4);
+VALUE(BOTTOM, 8);
+VALUE(FRONT, 16);
+VALUE(BACK, 32);
+VALUE(CONTACT, 0);
+VALUE(LEAVING, 1);
+VALUE(TIP, 2);
+VALUE(TIP_LEFT, 3);
+
+#if UINTPTR_MAX == UINT64_MAX
+#define SIZE(type, size) static_assert(sizeof(type) == size, #type)
+#define OFFSET(type, member, offset) static_assert(offsetof(type, member) == offset, #type "." #member)
+
+SIZE(echospline_scene_options, 224);
+OFFSET(echospline_scene_options, struct_size, 0);
+OFFSET(echospline_scene_options, dimension, 4);
+OFFSET(echospline_scene_options, kernel, 8);
+OFFSET(echospline_scene_options, precision, 12);
+OFFSET(echospline_scene_options, tip, 16);
+OFFSET(echospline_scene_options, loading, 20);
+OFFSET(echospline_scene_options, plane, 24);
+OFFSET(echospline_scene_options, clamped, 28);
+OFFSET(echospline_scene_options, level, 32);
+OFFSET(echospline_scene_options, shape, 36);
+OFFSET(echospline_scene_options, spacing, 48);
+OFFSET(echospline_scene_options, origin, 72);
+OFFSET(echospline_scene_options, sigma, 96);
+OFFSET(echospline_scene_options, delta, 104);
+OFFSET(echospline_scene_options, alpha1, 112);
+OFFSET(echospline_scene_options, alpha2, 120);
+OFFSET(echospline_scene_options, alpha3, 128);
+OFFSET(echospline_scene_options, length, 136);
+OFFSET(echospline_scene_options, drag, 144);
+OFFSET(echospline_scene_options, contact_spacing, 152);
+OFFSET(echospline_scene_options, anchor_spacing, 160);
+OFFSET(echospline_scene_options, poisson, 168);
+OFFSET(echospline_scene_options, radius, 176);
+OFFSET(echospline_scene_options, clamped_points, 184);
+OFFSET(echospline_scene_options, clamped_point_count, 192);
+OFFSET(echospline_scene_options, stiffness, 200);
+OFFSET(echospline_scene_options, stiffness_count, 208);
+OFFSET(echospline_scene_options, contact_room, 216);
+
+SIZE(echospline_pose, 64);
+OFFSET(echospline_pose, entry, 0);
+OFFSET(echospline_pose, tip, 24);
+OFFSET(echospline_pose, speed, 48);
+OFFSET(echospline_pose, dt, 56);
+
+SIZE(echospline_command, 64);
+OFFSET(echospline_command, entry, 0);
+OFFSET(echospline_command, tip, 24);
+OFFSET(echospline_command, lag, 48);
+OFFSET(echospline_command, fastest, 56);
+
+SIZE(echospline_landmark, 96);
+OFFSET(echospline_landmark, place, 0);
+OFFSET(echospline_landmark, displacement, 24);
+OFFSET(echospline_landmark, grip, 48);
+OFFSET(echospline_landmark, along, 72);
+OFFSET(echospline_landmark, node, 80);
+OFFSET(echospline_landmark, kind, 88);
+OFFSET(echospline_landmark, reserved, 92);
+
+SIZE(echospline_statistics, 64);
+OFFSET(echospline_statistics, struct_size, 0);
+OFFSET(echospline_statistics, reserved, 4);
+OFFSET(echospline_statistics, steps, 8);
+OFFSET(echospline_statistics, joined, 16);
+OFFSET(echospline_statistics, left, 24);
+OFFSET(echospline_statistics, rebuilt, 32);
+OFFSET(echospline_statistics, held_back, 40);
+OFFSET(echospline_statistics, allocations, 48);
+OFFSET(echospline_statistics, residual, 56);
+#endif
+
+int main(void) {
+  const uint32_t header =
+      (uint32_t)ECHOSPLINE_VERSION_MAJOR << 16 | ECHOSPLINE_VERSION_MINOR << 8 | ECHOSPLINE_VERSION_PATCH;
+  if (echospline_version() != header) {
+    printf("echospline_version() is %u, the header says %u\n", (unsigned)echospline_version(), (unsigned)header);
+    return 1;
+  }
+  return 0;
+}

@@ -1,0 +1,432 @@
+// The core in WebAssembly: scenes, tissues and the motion of a needle, over the C interface and nothing else.
+//
+// `load(bytes)` makes a Core from the bytes of echospline.wasm, in a page, a worker or node. Structs and enums have the names of
+// core/include/echospline/echospline.h; there are no defaults here. Handles live in the module's memory: `destroy` them, tissues first.
+// Typed arrays that a method returns are views of that memory, right until the next call into the core: copy what is to be kept.
+
+/** Version of the header that this file was written for. */
+export const VERSION = "0.1.0";
+
+export const Status = Object.freeze({
+  OK: 0, NULL_POINTER: 1, WRONG_SIZE: 2, WRONG_VALUE: 3, OUT_OF_MEMORY: 4, NOT_HELD: 5, NOT_SOLVED: 6, WRONG_STATE: 7,
+  FAILED_HANDLE: 8,
+});
+export const Level = Object.freeze({
+  LEVEL_BEST: 0, LEVEL_BASELINE: 1, LEVEL_AVX2: 2, LEVEL_AVX512: 3, LEVEL_NEON: 4, LEVEL_SIMD128: 5,
+});
+export const Kernel = Object.freeze({ THIN_PLATE: 0, ELASTIC: 1 });
+export const Precision = Object.freeze({ SINGLE: 0, DOUBLE: 1 });
+export const Tip = Object.freeze({ TIP_POINT: 0, TIP_NODE: 1 });
+export const Loading = Object.freeze({ FOLLOW: 0, IMMEDIATE: 1 });
+export const Plane = Object.freeze({ PLANE_STRESS: 0, PLANE_STRAIN: 1 });
+export const Edge = Object.freeze({ LEFT: 1, RIGHT: 2, TOP: 4, BOTTOM: 8, FRONT: 16, BACK: 32 });
+export const LandmarkKind = Object.freeze({ CONTACT: 0, LEAVING: 1, TIP: 2, TIP_LEFT: 3 });
+
+/** @typedef {"i32" | "u32" | "i64" | "f64" | "pointer"} Kind */
+/** @typedef {{ name: string, kind: Kind, count: number, offset: number }} Field */
+/** @typedef {{ fields: Field[], size: number }} Layout */
+/** @typedef {ArrayLike<number>} Numbers */
+
+/**
+ * Options of a scene, named as in echospline_scene_options; what is not given keeps the core's default.
+ * @typedef {{
+ *   dimension?: number, kernel?: number, precision?: number, tip?: number, loading?: number, plane?: number,
+ *   clamped?: number, level?: number, shape?: Numbers, spacing?: Numbers, origin?: Numbers, sigma?: number,
+ *   delta?: number, alpha1?: number, alpha2?: number, alpha3?: number, length?: number, drag?: number,
+ *   contact_spacing?: number, anchor_spacing?: number, poisson?: number, radius?: number, clamped_points?: Numbers,
+ *   stiffness?: Numbers, contact_room?: number
+ * }} SceneOptions
+ */
+/** @typedef {{ entry: Numbers, tip: Numbers, speed: number, dt: number }} Pose */
+/** @typedef {{ entry: Numbers, tip: Numbers, lag: number, fastest: number }} Command */
+/**
+ * @typedef {{
+ *   place: number[], displacement: number[], grip: number[], along: number, node: number, kind: number
+ * }} Landmark
+ */
+/**
+ * @typedef {{
+ *   steps: number, joined: number, left: number, rebuilt: number, held_back: number, allocations: number, residual: number
+ * }} Statistics
+ */
+
+const BYTES = { i32: 4, u32: 4, i64: 8, f64: 8, pointer: 4 };
+
+/**
+ * Lay a struct out as C does: every member at a multiple of its own size.
+ * @param {[string, Kind, number?][]} members
+ * @returns {Layout}
+ */
+function layout(members) {
+  let end = 0;
+  let widest = 1;
+  const fields = members.map(([name, kind, count = 1]) => {
+    const size = BYTES[kind];
+    const offset = Math.ceil(end / size) * size;
+    end = offset + size * count;
+    widest = Math.max(widest, size);
+    return { name, kind, count, offset };
+  });
+  return { fields, size: Math.ceil(end / widest) * widest };
+}
+
+/** Structs of the header, by their names there. @type {Readonly<Record<string, Layout>>} */
+export const LAYOUTS = Object.freeze({
+  echospline_scene_options: layout([
+    ["struct_size", "u32"], ["dimension", "i32"], ["kernel", "i32"], ["precision", "i32"], ["tip", "i32"],
+    ["loading", "i32"], ["plane", "i32"], ["clamped", "u32"], ["level", "i32"], ["shape", "i32", 3],
+    ["spacing", "f64", 3], ["origin", "f64", 3], ["sigma", "f64"], ["delta", "f64"], ["alpha1", "f64"],
+    ["alpha2", "f64"], ["alpha3", "f64"], ["length", "f64"], ["drag", "f64"], ["contact_spacing", "f64"],
+    ["anchor_spacing", "f64"], ["poisson", "f64"], ["radius", "f64"], ["clamped_points", "pointer"],
+    ["clamped_point_count", "i64"], ["stiffness", "pointer"], ["stiffness_count", "i64"], ["contact_room", "i64"],
+  ]),
+  echospline_pose: layout([["entry", "f64", 3], ["tip", "f64", 3], ["speed", "f64"], ["dt", "f64"]]),
+  echospline_command: layout([["entry", "f64", 3], ["tip", "f64", 3], ["lag", "f64"], ["fastest", "f64"]]),
+  echospline_landmark: layout([
+    ["place", "f64", 3], ["displacement", "f64", 3], ["grip", "f64", 3], ["along", "f64"], ["node", "i64"],
+    ["kind", "i32"], ["reserved", "i32"],
+  ]),
+  echospline_statistics: layout([
+    ["struct_size", "u32"], ["reserved", "i32"], ["steps", "i64"], ["joined", "i64"], ["left", "i64"],
+    ["rebuilt", "i64"], ["held_back", "i64"], ["allocations", "i64"], ["residual", "f64"],
+  ]),
+});
+
+/** A call of the core that did not succeed; `status` is one of Status. */
+export class CoreError extends Error {
+  /** @param {number} status @param {string} message */
+  constructor(status, message) {
+    super(message);
+    this.name = "CoreError";
+    this.status = status;
+  }
+}
+
+/**
+ * Load the core.
+ * @param {BufferSource} bytes contents of echospline.wasm
+ * @returns {Promise<Core>}
+ */
+export async function load(bytes) {
+  const { instance } = await WebAssembly.instantiate(bytes, {});
+  return new Core(instance);
+}
+
+/** The loaded module: its functions, memory and version. */
+export class Core {
+  /** @param {WebAssembly.Instance} instance */
+  constructor(instance) {
+    /** Functions of the header, as the module exports them. @type {any} */
+    this.functions = instance.exports;
+    this.functions._initialize?.();
+    const number = this.functions.echospline_version();
+    this.version = `${number >>> 16}.${(number >>> 8) & 255}.${number & 255}`;
+    if (this.version !== VERSION) {
+      throw new Error(`expected version ${VERSION} of echospline.wasm; got ${this.version}; build it anew: make wasm`);
+    }
+  }
+
+  /** Memory of the module; its buffer is replaced when it grows. @returns {ArrayBuffer} */
+  get buffer() {
+    return this.functions.memory.buffer;
+  }
+
+  /** Name of the processor level. @returns {string} */
+  get level() {
+    return this.text(this.functions.echospline_level_name(this.functions.echospline_level_best()));
+  }
+
+  /** Factor a scene. @param {SceneOptions} options @returns {Scene} */
+  scene(options) {
+    return new Scene(this, options);
+  }
+
+  /**
+   * Move a needle one step of dt seconds towards a command.
+   * @param {Pose} now @param {Command} command @param {number} dt @returns {Pose}
+   */
+  follow(now, command, dt) {
+    const pose = LAYOUTS.echospline_pose;
+    const at = this.allocate(2 * pose.size + LAYOUTS.echospline_command.size);
+    try {
+      this.write(at, pose, now);
+      this.write(at + pose.size, pose, { ...now, dt });
+      this.write(at + 2 * pose.size, LAYOUTS.echospline_command, command);
+      const status = this.functions.echospline_follow(at, at + 2 * pose.size, at + pose.size);
+      if (status !== Status.OK) throw new CoreError(status, this.text(this.functions.echospline_status_text(status)));
+      return /** @type {any} */ (this.read(at + pose.size, pose));
+    } finally {
+      this.functions.free(at);
+    }
+  }
+
+  /** Memory of the module; throws when there is none left. @param {number} size @returns {number} address */
+  allocate(size) {
+    const at = this.functions.malloc(Math.max(size, 1));
+    if (at === 0) throw new CoreError(Status.OUT_OF_MEMORY, `expected ${size} bytes of memory; there are none left`);
+    return at;
+  }
+
+  /** Text at an address. @param {number} at @returns {string} */
+  text(at) {
+    const bytes = new Uint8Array(this.buffer, at);
+    return new TextDecoder().decode(bytes.slice(0, bytes.indexOf(0)));
+  }
+
+  /** Write members of a struct; others stay. @param {number} at @param {Layout} layout @param {Record<string, any>} values */
+  write(at, layout, values) {
+    const view = new DataView(this.buffer, at, layout.size);
+    for (const { name, kind, count, offset } of layout.fields) {
+      const value = values[name];
+      if (value === undefined) continue;
+      for (let i = 0; i < count; ++i) {
+        const number = count > 1 ? value[i] ?? 0 : value;
+        const place = offset + i * BYTES[kind];
+        if (kind === "f64") view.setFloat64(place, number, true);
+        else if (kind === "i64") view.setBigInt64(place, BigInt(number), true);
+        else if (kind === "i32") view.setInt32(place, number, true);
+        else view.setUint32(place, number, true);
+      }
+    }
+  }
+
+  /** Read a struct. @param {number} at @param {Layout} layout @returns {Record<string, number | number[]>} */
+  read(at, layout) {
+    const view = new DataView(this.buffer, at, layout.size);
+    /** @type {Record<string, number | number[]>} */
+    const values = {};
+    for (const { name, kind, count, offset } of layout.fields) {
+      const numbers = Array.from({ length: count }, (_, i) => {
+        const place = offset + i * BYTES[kind];
+        if (kind === "f64") return view.getFloat64(place, true);
+        if (kind === "i64") return Number(view.getBigInt64(place, true));
+        return kind === "i32" ? view.getInt32(place, true) : view.getUint32(place, true);
+      });
+      values[name] = count > 1 ? numbers : numbers[0];
+    }
+    return values;
+  }
+
+  /** Copy numbers into the module. @param {Numbers} numbers @returns {number} address, to be freed */
+  place(numbers) {
+    const at = this.allocate(8 * numbers.length);
+    new Float64Array(this.buffer, at, numbers.length).set(numbers);
+    return at;
+  }
+
+  /** Throw unless a call succeeded. @param {number} status @param {string} what scene, tissue @param {number} handle */
+  check(status, what, handle) {
+    if (status === Status.OK) return;
+    throw new CoreError(status, this.text(this.functions[`echospline_${what}_message`](handle)));
+  }
+
+  /** Call a create function and return its handle. @param {string} what @param {number} from @returns {number} */
+  create(what, from) {
+    const at = this.allocate(4);
+    try {
+      new Uint32Array(this.buffer, at, 1)[0] = 0;
+      const status = this.functions[`echospline_${what}_create`](from, at);
+      const handle = new Uint32Array(this.buffer, at, 1)[0];
+      if (status !== Status.OK) {
+        const message = this.text(this.functions[`echospline_${what}_message`](handle));
+        this.functions[`echospline_${what}_destroy`](handle);
+        throw new CoreError(status, message);
+      }
+      return handle;
+    } finally {
+      this.functions.free(at);
+    }
+  }
+}
+
+/** What is given: mesh, clamped edges, parameters; factored once. */
+export class Scene {
+  /** @param {Core} core @param {SceneOptions} options */
+  constructor(core, options) {
+    this.core = core;
+    const shape = LAYOUTS.echospline_scene_options;
+    const at = core.allocate(shape.size);
+    const points = options.clamped_points && core.place(options.clamped_points);
+    const stiffness = options.stiffness && core.place(options.stiffness);
+    try {
+      core.write(at, shape, { struct_size: shape.size });
+      core.functions.echospline_scene_defaults(at);
+      core.write(at, shape, { ...options, clamped_points: points, stiffness });
+      /** @type {number} */
+      this.dimension = /** @type {any} */ (core.read(at, shape)).dimension;
+      const points_given = (options.clamped_points?.length ?? 0) / this.dimension;
+      core.write(at, shape, { clamped_point_count: points_given, stiffness_count: options.stiffness?.length ?? 0 });
+      this.handle = core.create("scene", at);
+    } finally {
+      for (const address of [at, points, stiffness]) if (address) core.functions.free(address);
+    }
+    this.level = core.text(core.functions.echospline_level_name(core.functions.echospline_scene_level(this.handle)));
+    this.nodeCount = Number(core.functions.echospline_scene_node_count(this.handle));
+    this.anchorCount = Number(core.functions.echospline_scene_anchor_count(this.handle));
+    this.sourceCount = Number(core.functions.echospline_scene_source_count(this.handle));
+  }
+
+  /** Anchors, dimension numbers each, mm. @returns {Float64Array} */
+  anchors() {
+    const { functions } = this.core;
+    const count = this.anchorCount * this.dimension;
+    const at = this.core.allocate(8 * count);
+    try {
+      this.core.check(functions.echospline_scene_anchors(this.handle, at, BigInt(count)), "scene", this.handle);
+      return new Float64Array(this.core.buffer, at, count).slice();
+    } finally {
+      functions.free(at);
+    }
+  }
+
+  /** Mesh nodes that may become contacts, ascending. @returns {number[]} */
+  sources() {
+    const { functions } = this.core;
+    const at = this.core.allocate(8 * this.sourceCount);
+    try {
+      const count = BigInt(this.sourceCount);
+      this.core.check(functions.echospline_scene_sources(this.handle, at, count), "scene", this.handle);
+      return Array.from(new BigInt64Array(this.core.buffer, at, this.sourceCount), Number);
+    } finally {
+      functions.free(at);
+    }
+  }
+
+  /** A tissue at rest in this scene. @returns {Tissue} */
+  tissue() {
+    return new Tissue(this);
+  }
+
+  destroy() {
+    this.core.functions.echospline_scene_destroy(this.handle);
+    this.handle = 0;
+  }
+}
+
+/** One needle's session in a scene. */
+export class Tissue {
+  /** @param {Scene} scene */
+  constructor(scene) {
+    this.core = scene.core;
+    this.dimension = scene.dimension;
+    this.numbers = scene.nodeCount * scene.dimension;
+    this.handle = this.core.create("tissue", scene.handle);
+    this.pose = this.core.allocate(LAYOUTS.echospline_pose.size);
+    this.field = this.core.allocate(8 * this.numbers);
+  }
+
+  /** Throw unless a call succeeded. @param {number} status */
+  check(status) {
+    this.core.check(status, "tissue", this.handle);
+  }
+
+  /** Back to rest. */
+  reset() {
+    this.check(this.core.functions.echospline_tissue_reset(this.handle));
+  }
+
+  /** Advance by one step. @param {Pose} pose */
+  advance(pose) {
+    const view = new Float64Array(this.core.buffer, this.pose, 8);
+    for (let i = 0; i < 3; ++i) {
+      view[i] = pose.entry[i] ?? 0;
+      view[3 + i] = pose.tip[i] ?? 0;
+    }
+    view[6] = pose.speed;
+    view[7] = pose.dt;
+    this.check(this.core.functions.echospline_advance(this.handle, this.pose));
+  }
+
+  /** Displacement of the mesh nodes, dimension numbers each, mm: a view. @returns {Float64Array} */
+  displacement() {
+    const { functions } = this.core;
+    this.check(functions.echospline_displacement(this.handle, this.field, BigInt(this.numbers)));
+    return new Float64Array(this.core.buffer, this.field, this.numbers);
+  }
+
+  /** The same in single precision: a view. @returns {Float32Array} */
+  displacementSingle() {
+    const { functions } = this.core;
+    this.check(functions.echospline_displacement_single(this.handle, this.field, BigInt(this.numbers)));
+    return new Float32Array(this.core.buffer, this.field, this.numbers);
+  }
+
+  /** Displacement of reference points, dimension numbers each, mm. @param {Numbers} points @returns {Float64Array} */
+  displacementAt(points) {
+    const { functions } = this.core;
+    const count = points.length / this.dimension;
+    const given = this.core.place(points);
+    const result = this.core.allocate(8 * points.length);
+    try {
+      this.check(functions.echospline_displacement_at(this.handle, given, BigInt(count), result));
+      return new Float64Array(this.core.buffer, result, points.length).slice();
+    } finally {
+      functions.free(given);
+      functions.free(result);
+    }
+  }
+
+  /** Landmarks that move. @returns {Landmark[]} */
+  landmarks() {
+    const { functions } = this.core;
+    const shape = LAYOUTS.echospline_landmark;
+    const number = this.core.allocate(8);
+    let list = 0;
+    try {
+      this.check(functions.echospline_landmarks(this.handle, 0, 0n, number));
+      const count = Number(new BigInt64Array(this.core.buffer, number, 1)[0]);
+      list = this.core.allocate(count * shape.size);
+      this.check(functions.echospline_landmarks(this.handle, list, BigInt(count), number));
+      return Array.from({ length: count }, (_, i) => /** @type {any} */ (this.core.read(list + i * shape.size, shape)));
+    } finally {
+      functions.free(number);
+      functions.free(list);
+    }
+  }
+
+  /** Counts since the tissue was created. @returns {Statistics} */
+  statistics() {
+    const shape = LAYOUTS.echospline_statistics;
+    const at = this.core.allocate(shape.size);
+    try {
+      this.core.write(at, shape, { struct_size: shape.size });
+      this.check(this.core.functions.echospline_tissue_statistics(this.handle, at));
+      return /** @type {any} */ (this.core.read(at, shape));
+    } finally {
+      this.core.functions.free(at);
+    }
+  }
+
+  /** The present state as bytes. @returns {Uint8Array} */
+  save() {
+    const { functions } = this.core;
+    const size = Number(functions.echospline_state_size(this.handle));
+    const at = this.core.allocate(size);
+    try {
+      this.check(functions.echospline_state_save(this.handle, at, BigInt(size)));
+      return new Uint8Array(this.core.buffer, at, size).slice();
+    } finally {
+      functions.free(at);
+    }
+  }
+
+  /** Make saved bytes the present state. @param {Uint8Array} bytes */
+  load(bytes) {
+    const { functions } = this.core;
+    const at = this.core.allocate(bytes.length);
+    try {
+      new Uint8Array(this.core.buffer, at, bytes.length).set(bytes);
+      this.check(functions.echospline_state_load(this.handle, at, BigInt(bytes.length)));
+    } finally {
+      functions.free(at);
+    }
+  }
+
+  destroy() {
+    const { functions } = this.core;
+    functions.echospline_tissue_destroy(this.handle);
+    functions.free(this.pose);
+    functions.free(this.field);
+    this.handle = this.pose = this.field = 0;
+  }
+}

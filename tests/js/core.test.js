@@ -1,0 +1,114 @@
+// The core in WebAssembly: its list of scenes, and agreement with the native library where its results are given.
+
+import assert from "node:assert/strict";
+import { existsSync, readFileSync, writeFileSync } from "node:fs";
+import { test } from "node:test";
+
+import { CoreError, LAYOUTS, Status, load } from "../../src/echospline/_native/echospline.js";
+
+const wasm = new URL("../../src/echospline/_native/echospline.wasm", import.meta.url);
+const skip = existsSync(wasm) ? false : "echospline.wasm is not built: run make wasm";
+const core = skip ? null : await load(readFileSync(wasm));
+const { scenes } = JSON.parse(readFileSync(new URL("../core/scenes.json", import.meta.url), "utf8"));
+// written by tests/test_core_scenes.py: per scene, the displacement after every command; tolerance in mm by precision
+const { results, tolerance } = process.env.ECHOSPLINE_NATIVE_RESULTS
+  ? JSON.parse(readFileSync(process.env.ECHOSPLINE_NATIVE_RESULTS, "utf8"))
+  : { results: null, tolerance: null };
+const compared = {};
+
+const largest = (a) => a.reduce((most, value) => Math.max(most, Math.abs(value)), 0);
+
+for (const { name, options, start, dt, commands } of scenes) {
+  test(`${name} runs${results ? " and agrees with the native core" : ""}`, { skip }, () => {
+    const scene = core.scene(options);
+    const tissue = scene.tissue();
+    let pose = { ...start, speed: 0, dt };
+    let worst = 0;
+    commands.forEach(({ steps, ...command }, k) => {
+      for (let i = 0; i < steps; ++i) {
+        pose = core.follow(pose, command, dt);
+        tissue.advance(pose);
+      }
+      const field = tissue.displacement();
+      assert.ok(field.every(Number.isFinite));
+      assert.ok(largest(field) > 0.01, "the tissue moves");
+      if (results) worst = Math.max(worst, largest(results[name][k].map((value, i) => value - field[i])));
+    });
+    const { steps, allocations } = tissue.statistics();
+    assert.equal(steps, commands.reduce((sum, command) => sum + command.steps, 0));
+    assert.equal(allocations, 0);
+    if (results) {
+      compared[name] = worst;
+      assert.ok(worst <= tolerance[options.precision], `differs by ${worst} mm`);
+    }
+    tissue.destroy();
+    scene.destroy();
+  });
+}
+
+test("a saved state comes back and goes on alike", { skip }, () => {
+  const { options, start, dt, commands } = scenes[0];
+  const scene = core.scene(options);
+  const [one, other] = [scene.tissue(), scene.tissue()];
+  let pose = { ...start, speed: 0, dt };
+  const advance = (tissues) => {
+    for (let i = 0; i < 10; ++i) {
+      pose = core.follow(pose, commands[0], dt);
+      for (const tissue of tissues) tissue.advance(pose);
+    }
+  };
+  advance([one]);
+  other.load(one.save());
+  advance([one, other]);
+  const field = Float64Array.from(one.displacement());
+  assert.ok(largest(other.displacement().map((value, i) => value - field[i])) < 1e-9);
+  assert.deepEqual(one.landmarks().map((landmark) => landmark.node), other.landmarks().map((landmark) => landmark.node));
+  assert.throws(() => other.load(one.save().slice(0, 20)), (error) => error.status === Status.WRONG_STATE);
+  one.reset();
+  assert.equal(largest(one.displacement()), 0);
+  for (const handle of [one, other, scene]) handle.destroy();
+});
+
+test("the displacement at a node is the node's", { skip }, () => {
+  const { options, start, dt, commands } = scenes[0];
+  const scene = core.scene(options);
+  const tissue = scene.tissue();
+  let pose = { ...start, speed: 0, dt };
+  for (let i = 0; i < 30; ++i) tissue.advance((pose = core.follow(pose, commands[0], dt)));
+  const node = 7 * options.shape[0] + 13;
+  const at = tissue.displacementAt([13 * options.spacing[0], 7 * options.spacing[1]]);
+  const field = tissue.displacement();
+  assert.ok(Math.hypot(at[0] - field[2 * node], at[1] - field[2 * node + 1]) < 1e-9);
+  const single = Float32Array.from(tissue.displacementSingle()); // both views are of the same memory
+  const double = tissue.displacement();
+  assert.ok(largest(single.map((value, i) => value - double[i])) < 1e-6);
+  tissue.destroy();
+  scene.destroy();
+});
+
+test("a wrong option is refused in one sentence", { skip }, () => {
+  assert.throws(() => core.scene({ ...scenes[0].options, shape: [1, 30] }), (error) => {
+    assert.ok(error instanceof CoreError);
+    assert.match(error.message, /shape/);
+    return true;
+  });
+});
+
+test("anchors and sources are counted as they are listed", { skip }, () => {
+  const scene = core.scene(scenes[0].options);
+  assert.equal(scene.anchors().length, scene.anchorCount * scene.dimension);
+  assert.equal(scene.sources().length, scene.sourceCount);
+  scene.destroy();
+});
+
+test("structs are laid out as the compiler lays them out", { skip: process.env.ECHOSPLINE_WASM_LAYOUTS ? false : "no layouts given" }, () => {
+  const given = JSON.parse(readFileSync(process.env.ECHOSPLINE_WASM_LAYOUTS, "utf8"));
+  const ours = Object.fromEntries(Object.entries(LAYOUTS).map(([name, { size, fields }]) => [
+    name, { size, offsets: Object.fromEntries(fields.map((field) => [field.name, field.offset])) },
+  ]));
+  assert.deepEqual(ours, given);
+});
+
+test("what was compared is written down", { skip: results ? false : "no native results given" }, () => {
+  writeFileSync(process.env.ECHOSPLINE_NATIVE_RESULTS + ".compared", JSON.stringify(compared));
+});
