@@ -17,6 +17,8 @@
 namespace echospline::ECHOSPLINE_CORE {
 
 constexpr double RESIDUAL = 1e-6;  // mm; misfit at the landmarks, for displacements of 1 mm, at which P is made anew
+constexpr double CAREFUL = 35;    // weight times sum of anchors' shares beyond which a tip's column is computed in double: its last digits
+                                   // would be more than 1e-5 mm of the field
 constexpr int VECTORS = 4;         // registers whose sums one pass over the landmarks fills
 
 /// Points at which the field is wanted, as vectors read them: blocks of VECTORS registers, the last one filled up with the last point.
@@ -170,7 +172,7 @@ class Response {
   Array<double> gram, P;       ///< (room c, ldk)
   Array<int32_t> parent;       ///< slot whose column a contact's is relative to; negative: an anchor's; (room)
   Array<int32_t> by_age;       ///< slots, the oldest first: parents stand before their children
-  Array<Real> columns;         ///< less the parent's, in the plane: (blocks, room, c, planes, block)
+  Array<Real> columns;         ///< less the parent's, in the plane: (blocks, room + 1, c, planes, block); the last for a tip
   Array<Real> row_weights;     ///< as `field` reads them
   double residual = 0;
   int64_t rebuilt = 0;
@@ -192,10 +194,10 @@ class Response {
     Array<double> new_felt, new_held, new_gram, new_P;
     Array<Real> new_columns, new_weights;
     Tip border;
-    const int64_t kept_columns = keeps_columns ? points_->blocks * contacts * c * planes * block : 0;
+    const int64_t kept_columns = keeps_columns ? points_->blocks * (contacts + 1) * c * planes * block : 0;
     if (!new_source.reserve(contacts) || !new_parent.reserve(contacts) || !new_by_age.reserve(contacts) || !new_place.reserve(contacts) || !new_felt.reserve(contacts * c * ld) ||
         !new_held.reserve(contacts * c * ld) || !new_gram.reserve(contacts * c * wide) || !new_P.reserve(contacts * c * wide) ||
-        !new_columns.reserve(kept_columns) || !new_weights.reserve((contacts * c + anchored_->order + 4) * D) ||
+        !new_columns.reserve(kept_columns) || !new_weights.reserve(((contacts + 1) * c + anchored_->order) * D) ||
         !border.reserve(ld, wide) || !carried_.reserve(wide))
       return false;
     for (int64_t i = 0; i < count; ++i)
@@ -208,7 +210,7 @@ class Response {
     }
     if (keeps_columns && count)
       for (int64_t b = 0; b < points_->blocks; ++b)
-        std::memcpy(&new_columns[b * contacts * c * planes * block], &columns[b * room * c * planes * block],
+        std::memcpy(&new_columns[b * (contacts + 1) * c * planes * block], &columns[b * (room + 1) * c * planes * block],
                     static_cast<size_t>(count * c * planes * block) * sizeof(Real));
     source_of.swap(new_source), place.swap(new_place), felt.swap(new_felt), held.swap(new_held), gram.swap(new_gram), P.swap(new_P);
     columns.swap(new_columns), row_weights.swap(new_weights), parent.swap(new_parent), by_age.swap(new_by_age);
@@ -290,7 +292,7 @@ class Response {
     const Base base = nearest(p);
     parent[k] = static_cast<int32_t>(base.slot), by_age[k] = static_cast<int32_t>(k);
     count = k + 1;
-    if constexpr (keeps_columns) keep_column(k, base);
+    if constexpr (keeps_columns) keep_column(k, p, base);
     return true;
   }
 
@@ -394,7 +396,7 @@ class Response {
 
   int64_t width() const { return rounded_up(count * c, ROW); }
   Real* column(int64_t block_index, int64_t slot) {
-    return columns.data() + (block_index * room + slot) * c * planes * block;
+    return columns.data() + (block_index * (room + 1) + slot) * c * planes * block;
   }
 
   void meet_contacts(Tip& tip) const {
@@ -484,6 +486,15 @@ class Response {
     }
   }
 
+  /// Sum of the anchors' shares in a column relative to a base, regardless of sign; `rows` is L_B^-1 [U P]' of the landmark.
+  double shares(const Base& base, const double* rows) const {
+    double sum = 0;
+    const double* other = base.slot >= 0 ? held.data() + base.slot * c * anchored_->ld : nullptr;
+    for (int64_t i = 0; i < anchored_->anchors; ++i) sum += std::fabs(rows[i] - (other ? other[i] : 0.0));
+    for (int64_t i = base.slot >= 0 ? -1 : base.anchor; i >= 0; i = anchored_->parent[i]) sum += std::fabs(rows[i] - 1) - std::fabs(rows[i]);
+    return sum;
+  }
+
   /// Row and column of the last contact in place of those of a slot, and zeros where they were.
   void move_last(Array<double>& A, int64_t slot, int64_t last) {
     for (int64_t i = 0; i < (last + 1) * c; ++i)
@@ -562,26 +573,26 @@ class Response {
     }
   }
 
-  /// Compute the column of a contact that has joined, less its parent's: it is kept, and what it lacks stays in every field. For the thin
-  /// plate, whose far field is the small rest of large terms, in double.
-  void keep_column(int64_t slot, const Base& base) {
+  /// Compute the column of a landmark at p, less its base's, into a slot; `border_.held` is the landmark's. For the thin plate, whose far field
+  /// is the small rest of large terms, in double: what a kept column lacks stays in every field.
+  void keep_column(int64_t slot, const Vec<D>& p, const Base& base) {
     typedef std::conditional_t<c == 1, double, Real> Number;
     typedef Vector<Number> N;
     constexpr int lanes = Lanes<Number>::count;
     constexpr int64_t part = VECTORS * lanes;
     const int64_t ld = anchored_->ld, m = anchored_->order;
-    double* h = border_.held.data();  // the contact's, which has been stored
+    double* h = border_.held.data();
     subtract_held(base, h);
     for (int64_t first = 0; first < points_->room(); first += part) {
       const int64_t b = first / block, within = first % block;
       N a[c][planes][VECTORS];
       for (int v = 0; v < VECTORS; ++v) {
-        N to_contact[D], to_base[D], U[c][c], other[c][c];
+        N to_p[D], to_base[D], U[c][c], other[c][c];
         for (int d = 0; d < D; ++d) {
           const N x = load_as<Number>(points_->x[d].data() + first + v * lanes);
-          to_contact[d] = x - static_cast<Number>(place[slot][d]), to_base[d] = x - static_cast<Number>(base.place[d]);
+          to_p[d] = x - static_cast<Number>(p[d]), to_base[d] = x - static_cast<Number>(base.place[d]);
         }
-        anchored_->kernel.at(to_contact, U);
+        anchored_->kernel.at(to_p, U);
         anchored_->kernel.at(to_base, other);
         for (int e = 0; e < c; ++e)
           for (int d = 0; d < planes; ++d) a[e][d][v] = U[d][e] - other[d][e];
@@ -602,25 +613,32 @@ class Response {
 
   Largest field_by_columns(const Displacements& w, const Tip* tip, const Vec<D>& s, const Field<D, Real>& was,
                            const Array<Real>& mask, Field<D, Real>& out) {
-    const int64_t kc = count * c, m = anchored_->order;
+    const int64_t m = anchored_->order;
+    int64_t rows = count * c;
     constexpr int lanes = Lanes<Real>::count;
     Real* weight = row_weights.data();
-    Real* h = weight + room * c * D;
+    Real* h = weight + (room + 1) * c * D;
     const Base base = tip ? nearest(tip->place) : Base{{}, -1, -1};
     carry(w, base.slot, s);
     // one weight per number of a column: (contact, component of the source), then the component of the field where one scalar serves all
-    for (int64_t j = 0; j < kc; ++j)
+    for (int64_t j = 0; j < rows; ++j)
       for (int r = 0; r < Displacements::count; ++r) weight[j * Displacements::count + r] = static_cast<Real>(carried_.side(r)[j]);
     Real s_of[D];
     for (int d = 0; d < D; ++d) s_of[d] = static_cast<Real>(s[d]);
     if (tip) {
       double* own = border_.held.data();
       std::memcpy(own, tip->held.data(), static_cast<size_t>(c * anchored_->ld) * sizeof(double));
-      subtract_held(base, own);
-      for (int64_t i = 0; i < m; ++i) {
-        double sum = 0;
-        for (int e = 0; e < c; ++e) sum += own[e * anchored_->ld + i] * (c == 1 ? 1.0 : s[e]);
-        h[i] = static_cast<Real>(sum);
+      if (c == 1 && shares(base, own) * norm(s) > CAREFUL) {
+        keep_column(count, tip->place, base);
+        for (int d = 0; d < D; ++d) weight[rows * D + d] = s_of[d];
+        tip = nullptr, rows += c;
+      } else {
+        subtract_held(base, own);
+        for (int64_t i = 0; i < m; ++i) {
+          double sum = 0;
+          for (int e = 0; e < c; ++e) sum += own[e * anchored_->ld + i] * (c == 1 ? 1.0 : s[e]);
+          h[i] = static_cast<Real>(sum);
+        }
       }
     }
     V change{}, reach{};
@@ -634,7 +652,7 @@ class Response {
       }
       const Real* e = column(b, 0);
       const Real* f = weight;
-      for (int64_t j = 0; j < kc; ++j) {
+      for (int64_t j = 0; j < rows; ++j) {
         if constexpr (c == 1) {
           for (int v = 0; v < VECTORS; ++v) {
             const V value = load(e + v * lanes);
