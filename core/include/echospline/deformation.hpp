@@ -12,7 +12,7 @@
 namespace echospline::ECHOSPLINE_CORE {
 
 constexpr int LATTICE = 4;              // pixels between lattice points: at 8 the interpolation misses 0.05 px near a tip, at 4 0.012 px
-constexpr float CENTRE_LIMIT = 0.05f;   // px at the centre of a lattice cell; a kink elsewhere in the cell misses at most twice that
+constexpr float LATTICE_LIMIT = 0.1f;   // px by which an interpolated position may miss the exact one: a tenth of a pixel is not seen
 constexpr float RIM = 0.5f;             // px: a pixel has an area, so tissue reaches half a pixel beyond the mesh's outermost nodes
 constexpr int CHECK_EVERY = 8;          // rows and columns between pixels at which the exact inverse is composed with the forward map
 
@@ -43,14 +43,16 @@ ECHOSPLINE_INLINE Cell cell_at(const Mesh& m, int i, int j) {
 }
 
 /// Where in the cell the point a + q lies. SIGN +1: where the map keeps the orientation, -1: where it turns tissue over.
-template <int SIGN>
-ECHOSPLINE_INLINE void invert(const Cell& c, float A, float B0, Floats qx, float qy, Floats& s, Floats& t) {
+/// Number: a float for one cell, or lanes for many.
+template <int SIGN, class Number>
+ECHOSPLINE_INLINE void invert(Number bx, Number by, Number cx, Number cy, Number dx, Number dy, Floats qx, Floats qy, Floats& s, Floats& t) {
   // (q - t c) x (b + t d) = 0, that is A t^2 + B t + C = 0
-  const Floats B = B0 - (qx * c.dy - qy * c.dx), C = qy * c.bx - qx * c.by;
+  const Number A = cx * dy - cy * dx;
+  const Floats B = (cx * by - cy * bx) - (qx * dy - qy * dx), C = qy * bx - qx * by;
   const Floats r = root(greatest(B * B - 4.0f * A * C, all(0.0f)));
   t = 2.0f * C / (float(SIGN) * r - B);
-  const Floats ex = c.bx + t * c.dx, ey = c.by + t * c.dy;
-  s = ((qx - t * c.cx) * ex + (qy - t * c.cy) * ey) / (ex * ex + ey * ey);
+  const Floats ex = bx + t * dx, ey = by + t * dy;
+  s = ((qx - t * cx) * ex + (qy - t * cy) * ey) / (ex * ex + ey * ey);
 }
 
 /// Limits of s and t in which a cell covers pixels: its own square, and the rim where the mesh ends.
@@ -63,9 +65,9 @@ ECHOSPLINE_INLINE Limits limits_of(const Mesh& m, int i, int j) {
           j == 0 ? -RIM / m.hy - et : -et, j == m.ny - 2 ? 1 + RIM / m.hy + et : 1 + et};
 }
 
-/// For LANES cells from (i, j): the lattice points (every `step`-th pixel, columns x rows of them) that they may cover, and whether they fold.
+/// For LANES cells: the points that they may cover, and whether they fold.
 struct Boxes {
-  int32_t first_row[LANES], last_row[LANES], first[LANES], last[LANES], folded[LANES];
+  Ints first_row, last_row, first, last, folded;
 };
 /// Corners' Jacobian determinants times hx hy; bilinear cells have their extremes there.
 struct Corners {
@@ -93,8 +95,17 @@ ECHOSPLINE_INLINE Floats smallest(const Corners& c) {
   return least(least(c.top_left, c.top_right), least(c.bottom_left, c.bottom_right));
 }
 
-ECHOSPLINE_INLINE Boxes boxes_at(const Mesh& m, int i, int j, int step, int columns, int rows) {
-  const CellLanes c = cells_at(m, i, j);
+/// Which pixels are traced: every `step`-th, and the last of each row and column whatever the step.
+struct Raster {
+  int step, last_column, last_row;  // in pixels
+  int columns, rows;                // points
+
+  static constexpr Raster of(int step, int columns, int rows) {
+    return {step, columns - 1, rows - 1, (columns - 2 + step) / step + 1, (rows - 2 + step) / step + 1};
+  }
+};
+
+ECHOSPLINE_INLINE Boxes boxes_at(const Mesh& m, int i, int j, const CellLanes& c, const Raster& raster) {
   const Ints n = counting() + i;
   const Limits inner = {-m.slack / m.hx, 1 + m.slack / m.hx, -m.slack / m.hy, 1 + m.slack / m.hy};
   const Floats s0 = pick(n == 0, all(inner.s0 - RIM / m.hx), all(inner.s0));
@@ -107,21 +118,24 @@ ECHOSPLINE_INLINE Boxes boxes_at(const Mesh& m, int i, int j, int step, int colu
       const Floats x = c.ax + s * c.bx + t * (c.cx + s * c.dx), y = c.ay + s * c.by + t * (c.cy + s * c.dy);
       low_x = least(x, low_x), high_x = greatest(x, high_x), low_y = least(y, low_y), high_y = greatest(y, high_y);
     }
-  // first point at or after `low`, last at or before `high`, within the lattice
-  const float per = 1.0f / step;
-  const auto first = [&](Floats low, int count) __attribute__((always_inline)) {
+  // first point at or after `low`, last at or before `high`
+  const float per = 1.0f / raster.step;
+  const auto first = [&](Floats low, int last_pixel, int count) __attribute__((always_inline)) {
     const Floats x = within(low * per, 0.0f, float(count));
-    const Ints k = to_ints(x);
-    return k - (Ints)(x > to_floats(k));
+    const Ints k = to_ints(x), up = k - (Ints)(x > to_floats(k));
+    return pick(low > float(last_pixel), all_ints(count), pick(up < count, up, all_ints(count - 1)));
   };
-  const auto last = [&](Floats high, int count) __attribute__((always_inline)) {
-    return to_ints(within(high * per + 1.0f, 0.0f, float(count))) - 1;
+  const auto last = [&](Floats high, int last_pixel, int count) __attribute__((always_inline)) {
+    const Ints k = to_ints(within(high * per + 1.0f, 0.0f, float(count))) - 1;
+    return pick(high >= float(last_pixel), all_ints(count - 1), k);
   };
   Boxes b;
-  const Ints r0 = first(low_y, rows), r1 = last(high_y, rows), c0 = first(low_x, columns), c1 = last(high_x, columns);
-  const Ints folded = ~(smallest(jacobian(c)) > 0.0f);
-  std::memcpy(b.first_row, &r0, sizeof r0), std::memcpy(b.last_row, &r1, sizeof r1);
-  std::memcpy(b.first, &c0, sizeof c0), std::memcpy(b.last, &c1, sizeof c1), std::memcpy(b.folded, &folded, sizeof folded);
+  b.first_row = first(low_y, raster.last_row, raster.rows), b.last_row = last(high_y, raster.last_row, raster.rows);
+  b.first = first(low_x, raster.last_column, raster.columns), b.last = last(high_x, raster.last_column, raster.columns);
+  b.folded = ~(smallest(jacobian(c)) > 0.0f);
+  // empty ones: none of the lanes beyond the mesh, and none that lie outside the picture
+  const Ints empty = (n > m.nx - 2) | (b.first > b.last) | (b.first_row > b.last_row);
+  b.last = pick(empty, b.first - 1, b.last);
   return b;
 }
 
@@ -137,24 +151,31 @@ struct Marks {
   uint8_t* at;
   int columns, rows;
   int64_t stride;
+  int first = 0, last = -1, first_row = 0, last_row = -1;  // box around all of them
+
+  void widen(int row, int begin, int end) {
+    if (last_row < 0) first = begin, last = end, first_row = row;
+    first = smaller(first, begin), last = larger(last, end), first_row = smaller(first_row, row), last_row = larger(last_row, row);
+  }
 };
 
 /// Trace points first..last of one row in one cell. A turned-over place counts only where no upright one is found.
 template <bool FOLDED>
-ECHOSPLINE_INLINE void trace_row(const Mesh& m, const Cell& c, const Limits& limits, int step, int row, int first, int last,
+ECHOSPLINE_INLINE void trace_row(const Mesh& m, const Cell& c, const Limits& limits, const Raster& raster, int row, int first, int last,
                                  const Positions& out) {
-  const float A = c.cx * c.dy - c.cy * c.dx, B0 = c.cx * c.by - c.cy * c.bx;
-  const float qy = row * float(step) - c.ay;
+  const Floats qy = all(smaller(row * raster.step, raster.last_row) - c.ay);
   float *x = out.x + row * out.stride, *y = out.y + row * out.stride;
   for (int k = first; k <= last; k += LANES) {
-    const Floats qx = (counted() + float(k)) * float(step) - c.ax;
+    Floats at = (counted() + float(k)) * float(raster.step);
+    if (raster.step > 1) at = least(at, all(float(raster.last_column)));
+    const Floats qx = at - c.ax;
     Floats s, t;
-    invert<1>(c, A, B0, qx, qy, s, t);
+    invert<1>(c.bx, c.by, c.cx, c.cy, c.dx, c.dy, qx, qy, s, t);
     const Ints in = (s >= limits.s0) & (s <= limits.s1) & (t >= limits.t0) & (t <= limits.t1);
     Floats at_x = load(x + k), at_y = load(y + k);
     if constexpr (FOLDED) {
       Floats turned_s, turned_t;
-      invert<-1>(c, A, B0, qx, qy, turned_s, turned_t);
+      invert<-1>(c.bx, c.by, c.cx, c.cy, c.dx, c.dy, qx, qy, turned_s, turned_t);
       const Ints turned = (turned_s >= limits.s0) & (turned_s <= limits.s1) & (turned_t >= limits.t0) &
                           (turned_t <= limits.t1) & (at_x != at_x);
       at_x = pick(turned, c.px + turned_s * m.hx, at_x), at_y = pick(turned, c.py + turned_t * m.hy, at_y);
@@ -165,39 +186,79 @@ ECHOSPLINE_INLINE void trace_row(const Mesh& m, const Cell& c, const Limits& lim
 }
 
 template <bool FOLDED>
-ECHOSPLINE_INLINE void trace_cell(const Mesh& m, int i, int j, int step, const Boxes& b, int lane, const Marks* marks,
-                                  const Positions& out) {
+inline void trace_cell(const Mesh& m, int i, int j, const Raster& raster, const Boxes& b, int lane, const Marks* marks, const Positions& out) {
   const Cell c = cell_at(m, i, j);
   const Limits limits = limits_of(m, i, j);
   const int first = b.first[lane], last = b.last[lane], first_row = b.first_row[lane], last_row = b.last_row[lane];
   if (!marks) {
-    for (int row = first_row; row <= last_row; ++row) trace_row<FOLDED>(m, c, limits, step, row, first, last, out);
+    for (int row = first_row; row <= last_row; ++row) trace_row<FOLDED>(m, c, limits, raster, row, first, last, out);
     return;
   }
-  for (int band = first_row / LATTICE; band <= last_row / LATTICE; ++band) {
+  // runs of marked lattice cells; the last one of a row or column holds the picture's last pixels
+  const int first_cell = smaller(first / LATTICE, marks->columns - 1), last_cell = smaller(last / LATTICE, marks->columns - 1);
+  const int first_band = smaller(first_row / LATTICE, marks->rows - 1), last_band = smaller(last_row / LATTICE, marks->rows - 1);
+  for (int band = first_band; band <= last_band; ++band) {
     const uint8_t* mark = marks->at + band * marks->stride;
-    const int top = larger(first_row, band * LATTICE), bottom = smaller(last_row, band * LATTICE + LATTICE - 1);
-    for (int k = first / LATTICE; k <= last / LATTICE; ++k) {
+    const int top = larger(first_row, band * LATTICE), bottom = band == last_band ? last_row : band * LATTICE + LATTICE - 1;
+    for (int k = first_cell; k <= last_cell; ++k) {
       if (!mark[k]) continue;
       const int begin = larger(first, k * LATTICE);
-      while (k < last / LATTICE && mark[k + 1]) ++k;
-      const int end = smaller(last, k * LATTICE + LATTICE - 1);
-      for (int row = top; row <= bottom; ++row) trace_row<FOLDED>(m, c, limits, step, row, begin, end, out);
+      while (k < last_cell && mark[k + 1]) ++k;
+      const int end = k == last_cell ? last : k * LATTICE + LATTICE - 1;
+      for (int row = top; row <= bottom; ++row) trace_row<FOLDED>(m, c, limits, raster, row, begin, end, out);
     }
   }
 }
 
-/// Trace every `step`-th pixel back, cell by cell; with marks, only pixels of marked lattice cells.
-inline void trace(const Mesh& m, int step, const Marks* marks, const Positions& out) {
+/// Trace the points of LANES cells that do not fold, each lane in its own cell: for cells that hold few points.
+ECHOSPLINE_INLINE void trace_cells(const Mesh& m, int i, int j, const CellLanes& c, const Boxes& b, const Raster& raster, const Positions& out) {
+  const Ints n = counting() + i;
+  const float es = m.slack / m.hx, et = m.slack / m.hy;
+  const Floats s0 = pick(n == 0, all(-es - RIM / m.hx), all(-es)), s1 = pick(n == m.nx - 2, all(1 + es + RIM / m.hx), all(1 + es));
+  const Floats t0 = all(j == 0 ? -et - RIM / m.hy : -et), t1 = all(j == m.ny - 2 ? 1 + et + RIM / m.hy : 1 + et);
+  const Floats px = m.x0 + to_floats(n) * m.hx;
+  const float py = m.y0 + j * m.hy;
+  const int wide = most(b.last - b.first), high = most(b.last_row - b.first_row);
+  const Ints nowhere = all_ints(int32_t(out.stride - 1));  // padding: what is written there is not read
+  for (int down = 0; down <= high; ++down) {
+    const Ints row = b.first_row + down;
+    const Floats qy = least(to_floats(row) * float(raster.step), all(float(raster.last_row))) - c.ay;
+    for (int across = 0; across <= wide; ++across) {
+      const Ints column = b.first + across;
+      const Floats qx = least(to_floats(column) * float(raster.step), all(float(raster.last_column))) - c.ax;
+      Floats s, t;
+      invert<1>(c.bx, c.by, c.cx, c.cy, c.dx, c.dy, qx, qy, s, t);
+      const Ints in = (s >= s0) & (s <= s1) & (t >= t0) & (t <= t1) & (column <= b.last) & (row <= b.last_row);
+      scatter(pick(in, row * int32_t(out.stride) + column, nowhere), px + s * m.hx, py + t * m.hy, out.x, out.y);
+    }
+  }
+}
+constexpr int FEW_POINTS = 25;  // in a cell: above that a row of points of one cell fills the lanes better
+
+/// Trace the raster's points back, cell by cell; with marks, only pixels of marked lattice cells.
+inline void trace(const Mesh& m, const Raster& raster, const Marks* marks, const Positions& out) {
   for (int j = 0; j < m.ny - 1; ++j)
     for (int i = 0; i < m.nx - 1; i += LANES) {
-      const Boxes b = boxes_at(m, i, j, step, out.columns, out.rows);
-      for (int lane = 0; lane < LANES && i + lane < m.nx - 1; ++lane) {
-        if (b.first[lane] > b.last[lane] || b.first_row[lane] > b.last_row[lane]) continue;
+      const CellLanes c = cells_at(m, i, j);
+      Boxes b = boxes_at(m, i, j, c, raster);
+      Ints alone = b.first <= b.last;  // lanes that are traced on their own
+      if (marks)
+        alone &= (b.last >= marks->first * LATTICE) & (b.first < (marks->last + 1) * LATTICE + 1) & (b.last_row >= marks->first_row * LATTICE) &
+                 (b.first_row < (marks->last_row + 1) * LATTICE + 1);
+      if (!any(alone)) continue;
+      if (!marks && (most(b.last - b.first) + 1) * (most(b.last_row - b.first_row) + 1) <= FEW_POINTS) {
+        alone &= b.folded;
+        Boxes sound = b;
+        sound.last = pick(b.folded, b.first - 1, b.last);
+        trace_cells(m, i, j, c, sound, raster, out);
+        if (!any(alone)) continue;
+      }
+      for (int lane = 0; lane < LANES; ++lane) {
+        if (!alone[lane]) continue;
         if (b.folded[lane])
-          trace_cell<true>(m, i + lane, j, step, b, lane, marks, out);
+          trace_cell<true>(m, i + lane, j, raster, b, lane, marks, out);
         else
-          trace_cell<false>(m, i + lane, j, step, b, lane, marks, out);
+          trace_cell<false>(m, i + lane, j, raster, b, lane, marks, out);
       }
     }
 }
@@ -233,81 +294,96 @@ inline Folds find_folds(const Mesh& m) {
   return found;
 }
 
-/// Forward map at reference positions less the pixels p where they should come to lie, and the same traced back through the gradient:
-/// how far the position is off.
-struct Misfit {
-  Floats forward, back;  // squared, px^2
-};
-ECHOSPLINE_INLINE Misfit misfit_at(const Mesh& m, Floats x, Floats y, Floats px, Floats py) {
+/// Squared distance between the forward map of reference positions and the pixels p where they should come to lie, px^2.
+ECHOSPLINE_INLINE Floats square_misfit_at(const Mesh& m, Floats x, Floats y, Floats px, Floats py) {
   const Floats fx = (x - m.x0) * (1.0f / m.hx), fy = (y - m.y0) * (1.0f / m.hy);
   const Ints i = to_ints(within(fx, 0.0f, float(m.nx - 2))), j = to_ints(within(fy, 0.0f, float(m.ny - 2)));
   const Floats s = fx - to_floats(i), t = fy - to_floats(j);
   const Ints at = j * int32_t(m.stride) + i, below = at + int32_t(m.stride);
-  const Floats u00 = gather(m.ux, at), u01 = gather(m.ux + 1, at) - u00, u10 = gather(m.ux, below) - u00,
-               u11 = gather(m.ux + 1, below) - u00 - u01 - u10;
-  const Floats v00 = gather(m.uy, at), v01 = gather(m.uy + 1, at) - v00, v10 = gather(m.uy, below) - v00,
-               v11 = gather(m.uy + 1, below) - v00 - v01 - v10;
-  const Floats rx = x + (u00 + s * u01 + t * (u10 + s * u11)) - px, ry = y + (v00 + s * v01 + t * (v10 + s * v11)) - py;
-  const Floats xx = 1.0f + (u01 + t * u11) * (1.0f / m.hx), xy = (u10 + s * u11) * (1.0f / m.hy);
-  const Floats yx = (v01 + t * v11) * (1.0f / m.hx), yy = 1.0f + (v10 + s * v11) * (1.0f / m.hy);
-  const Floats det = 1.0f / (xx * yy - xy * yx), bx = (yy * rx - xy * ry) * det, by = (xx * ry - yx * rx) * det;
-  return {rx * rx + ry * ry, bx * bx + by * by};
+  const auto between = [&](const float* u) __attribute__((always_inline)) {
+    const Floats a = gather(u, at), b = gather(u + 1, at), c = gather(u, below), d = gather(u + 1, below);
+    const Floats top = a + s * (b - a), bottom = c + s * (d - c);
+    return top + t * (bottom - top);
+  };
+  const Floats rx = x + between(m.ux) - px, ry = y + between(m.uy) - py;
+  return rx * rx + ry * ry;
 }
 
 /// What the lattice left to be traced exactly, and how far the rest is off.
 struct LatticeCheck {
   int64_t marked = 0;
-  float residual = 0;    // px, largest misfit of the forward map
-  float difference = 0;  // px, largest estimated distance from the exact position: twice the one at cell centres
+  float difference = 0;  // px, largest estimated distance of an interpolated position from the exact one
 };
 
+/// Largest distance between a line through numbers b and c and a curve with a bend in between: a quarter of the second differences there.
+/// A bend is exactly that wide, a parabola half; differences that reach outside the tissue give way to the ones that do not.
+ECHOSPLINE_INLINE Floats bend(Floats a, Floats b, Floats c, Floats d) {
+  const Floats before = magnitude(a - b - (b - c)), after = magnitude(b - c - (c - d));
+  return 0.25f * (pick(before == before, before, after) + pick(after == after, after, before));
+}
+/// The same over both directions of a lattice cell; rows from the one above it.
+ECHOSPLINE_INLINE Floats bend_in_cell(const float* p, int64_t stride) {
+  const float* q = p + stride;
+  const Floats a = load(p), b = load(p + 1), c = load(q), d = load(q + 1);
+  const Floats across = greatest(bend(load(p - 1), a, b, load(p + 2)), bend(load(q - 1), c, d, load(q + 2)));
+  const Floats down = greatest(bend(load(p - stride), a, c, load(q + stride)), bend(load(p - stride + 1), b, d, load(q + stride + 1)));
+  return across + down;
+}
+
 /// Mark the lattice cells in which interpolation is not good enough.
-inline LatticeCheck mark_cells(const Mesh& m, const Positions& lattice, Marks& marks) {
-  // A mesh finer than the lattice bends between the centre and the corners too.
-  const bool fine = m.hx < LATTICE || m.hy < LATTICE;
-  constexpr float share[5][2] = {{0.5f, 0.5f}, {0.25f, 0.25f}, {0.75f, 0.25f}, {0.25f, 0.75f}, {0.75f, 0.75f}};
+inline LatticeCheck mark_cells(const Positions& lattice, Marks& marks) {
   LatticeCheck check;
-  Floats residual = all(0.0f), difference = all(0.0f);
+  Floats worst = all(0.0f);
   for (int row = 0; row < marks.rows; ++row) {
-    const float *x0 = lattice.x + row * lattice.stride, *y0 = lattice.y + row * lattice.stride;
-    const float *x1 = x0 + lattice.stride, *y1 = y0 + lattice.stride;
+    const float *x = lattice.x + row * lattice.stride, *y = lattice.y + row * lattice.stride;
     uint8_t* mark = marks.at + row * marks.stride;
     for (int k = 0; k < marks.columns; k += LANES) {
       const Ints held = counting() + k < marks.columns;
-      const Floats xa = load(x0 + k), xb = load(x0 + k + 1), xc = load(x1 + k), xd = load(x1 + k + 1);
-      const Floats ya = load(y0 + k), yb = load(y0 + k + 1), yc = load(y1 + k), yd = load(y1 + k + 1);
-      Floats forward = all(0.0f), back = forward;
-      Ints good = held;
-      for (int n = 0; n < (fine ? 5 : 1); ++n) {
-        const float f = share[n][0], g = share[n][1];
-        const Floats x = (1 - g) * ((1 - f) * xa + f * xb) + g * ((1 - f) * xc + f * xd);
-        const Floats y = (1 - g) * ((1 - f) * ya + f * yb) + g * ((1 - f) * yc + f * yd);
-        const Misfit miss = misfit_at(m, x, y, (counted() + (float(k) + f)) * float(LATTICE), all((row + g) * float(LATTICE)));
-        good &= miss.back < CENTRE_LIMIT * CENTRE_LIMIT;  // no where a corner is nowhere
-        forward = greatest(miss.forward, forward), back = greatest(miss.back, back);
-      }
-      residual = pick(good, greatest(forward, residual), residual);
-      difference = pick(good, greatest(back, difference), difference);
-      const Ints bad = ~good & held & 1;
-      for (int lane = 0; lane < LANES && k + lane < marks.columns; ++lane) {
-        mark[k + lane] = uint8_t(bad[lane]);
-        check.marked += bad[lane];
-      }
+      const Floats off_x = bend_in_cell(x + k, lattice.stride), off_y = bend_in_cell(y + k, lattice.stride);
+      const Floats square = off_x * off_x + off_y * off_y;  // not a number where a corner is nowhere
+      const Ints good = (square < LATTICE_LIMIT * LATTICE_LIMIT) & held, bad = ~good & held;
+      worst = pick(good, greatest(square, worst), worst);
+      store_bytes(mark + k, bad & 1);
+      if (!any(bad)) continue;
+      check.marked -= sum(bad);
+      marks.widen(row, k, smaller(k + LANES, marks.columns) - 1);
     }
   }
-  check.residual = __builtin_sqrtf(largest<float>(residual));
-  check.difference = 2 * __builtin_sqrtf(largest<float>(difference));
+  check.difference = __builtin_sqrtf(largest<float>(worst));
   return check;
 }
 
+/// Largest misfit of the forward map in the middle of the cells that are interpolated, px.
+inline float residual_of(const Mesh& m, const Positions& lattice, const Marks& marks, const Raster& raster) {
+  Floats worst = all(0.0f);
+  for (int row = 0; row < marks.rows; ++row)
+    for (int k = 0; k < marks.columns; k += LANES) {
+      const float *x = lattice.x + row * lattice.stride + k, *y = lattice.y + row * lattice.stride + k;
+      const uint8_t* mark = marks.at + row * marks.stride + k;
+      // the last column and row of points lie at the last pixel
+      const Floats left = (counted() + float(k)) * float(LATTICE), right = least(left + float(LATTICE), all(float(raster.last_column)));
+      const float top = float(row * LATTICE), bottom = smaller(top + LATTICE, float(raster.last_row));
+      const float f = row == marks.rows - 1 ? (bottom - top) / (2 * LATTICE) : 0.5f;  // stored as if a whole step below
+      const Floats g = (right - left) * (0.5f / LATTICE);
+      const Floats ax = load(x) + f * (load(x + lattice.stride) - load(x)), bx = load(x + 1) + f * (load(x + lattice.stride + 1) - load(x + 1));
+      const Floats ay = load(y) + f * (load(y + lattice.stride) - load(y)), by = load(y + 1) + f * (load(y + lattice.stride + 1) - load(y + 1));
+      Ints good = counting() + k < marks.columns;
+      for (int lane = 0; lane < LANES; ++lane) good[lane] &= mark[lane] ? 0 : -1;
+      const Floats miss = square_misfit_at(m, ax + g * (bx - ax), ay + g * (by - ay), 0.5f * (left + right), all(0.5f * (top + bottom)));
+      worst = pick(good, greatest(miss, worst), worst);
+    }
+  return __builtin_sqrtf(largest<float>(worst));
+}
+
 /// Mark the lattice cells that folded cells of the mesh may cover.
-inline int64_t mark_folds(const Mesh& m, Marks& marks) {
+inline int64_t mark_folds(const Mesh& m, const Raster& raster, Marks& marks) {
   int64_t added = 0;
   for (int j = 0; j < m.ny - 1; ++j)
     for (int i = 0; i < m.nx - 1; i += LANES) {
-      const Boxes b = boxes_at(m, i, j, 1, marks.columns * LATTICE, marks.rows * LATTICE);
-      for (int lane = 0; lane < LANES && i + lane < m.nx - 1; ++lane) {
-        if (!b.folded[lane]) continue;
+      const Boxes b = boxes_at(m, i, j, cells_at(m, i, j), raster);
+      if (!any(b.folded & (b.first <= b.last))) continue;
+      for (int lane = 0; lane < LANES; ++lane) {
+        if (!b.folded[lane] || b.first[lane] > b.last[lane]) continue;
         const int first = larger(b.first[lane] - 1, 0) / LATTICE, last = smaller((b.last[lane] + 1) / LATTICE, marks.columns - 1);
         const int top = larger(b.first_row[lane] - 1, 0) / LATTICE,
                   bottom = smaller((b.last_row[lane] + 1) / LATTICE, marks.rows - 1);
@@ -316,6 +392,7 @@ inline int64_t mark_folds(const Mesh& m, Marks& marks) {
             uint8_t& mark = marks.at[row * marks.stride + k];
             added += !mark;
             mark = 1;
+            marks.widen(row, k, k);
           }
       }
     }
@@ -332,8 +409,8 @@ inline float residual_of(const Mesh& m, const Positions& p) {
       const Ints at = pick(column < p.columns, column, Ints{});
       const Floats x = gather(p.x + row * p.stride, at), y = gather(p.y + row * p.stride, at);
       const Ints in = (x >= m.x0) & (x <= right) & (y >= m.y0) & (y <= bottom);
-      const Misfit miss = misfit_at(m, x, y, to_floats(at), all(float(row)));
-      worst = pick(in, greatest(miss.forward, worst), worst);
+      const Floats miss = square_misfit_at(m, x, y, to_floats(at), all(float(row)));
+      worst = pick(in, greatest(miss, worst), worst);
     }
   return __builtin_sqrtf(largest<float>(worst));
 }

@@ -21,8 +21,8 @@ constexpr int MOST_TAPS = 480;           // half width of the smoothing, entries
 constexpr int PROFILE_COUNT = 8192;      // most entries of P
 constexpr int KNOTS = 33;                // places on the needle at which angles are evaluated
 constexpr int TAIL_COUNT = 256;          // entries along the ring-down
-constexpr float FAINT = -70.0f;          // dB: weaker echoes are not drawn
-constexpr float REACH = 4.2f;            // sigmas at which exp(-q) is below FAINT for the strongest line
+constexpr float REACH = 4.2f;            // sigmas at which exp(-q) is 77 dB down: weaker echoes are not drawn
+constexpr float TAIL_END = -55.0f;       // dB at which the ring-down ends: below the tissue, and each millimetre more costs time
 constexpr float COMB = 0.34f;            // mm between rungs of the tail: 0.27 diameters of an 18-gauge needle with its stylet
 constexpr float BEVEL_LENGTH = 1.8f;     // diameters
 constexpr float HEEL = 12.0f;            // dB by which the heel is weaker than the tip
@@ -293,7 +293,7 @@ class NeedleEcho {
     const Floats fan = spread_ * height / greatest(v.depth, all(1.0f));
     const Floats per_slice = 0.70710678f / root(fan * fan + elevation_ * elevation_);
     const Floats flat = root(v.ul * v.ul + uz_ * uz_), half = 0.5f * diameter * flat / greatest(magnitude(v.ul), all(1e-3f)) + 1e-6f;
-    const Floats covered = 0.5f * (error_function((z + half) * per_slice) - error_function((z - half) * per_slice));
+    const Floats covered = 0.5f * (rough_error_function((z + half) * per_slice) - rough_error_function((z - half) * per_slice));
     // distance from the shaft in the plane: the shadow sets in gradually
     const float in_plane = ux_ * ux_ + uy_ * uy_;
     const Floats on = within((v.rl * v.ul + v.ra * v.ua) * (1.0f / (in_plane + 1e-6f)), 0.0f, length);
@@ -327,7 +327,7 @@ class NeedleEcho {
       const double off = (tilt - look * n.steering * in_plane) / width;
       mirror += __builtin_exp(-off * off) / 3;
     }
-    const double step = larger(0.0, smaller(1.0, ((tilt < 0 ? -tilt : tilt) - 50) / 40)), off = tilt / (0.5 * width);
+    const double step = larger(0.0, smaller(1.0, ((tilt < 0 ? -tilt : tilt) - 50) / 40)), off = tilt / (0.4 * width);
     Knot k;
     k.specular = float(n.specular + 10 * __builtin_log10(mirror + 1e-12) + 20 * __builtin_log10(smaller(1.0, sigma / lateral)));
     k.rough = float(n.roughness - n.rolloff * step + 10 * __builtin_log10(smaller(1.5, sigma / lateral)));
@@ -358,7 +358,7 @@ class NeedleEcho {
     if (!(parts_ & (ECHOSPLINE_SHAFT | ECHOSPLINE_TAIL | ECHOSPLINE_BEVEL))) return;
     const double widest = larger(n.lateral, n.axial), deepest = larger(slice_at(extent.top), slice_at(extent.bottom));
     const double pad = 5 * larger(widest, u_[2] * u_[2] > 1e-4 ? deepest : 0.0);
-    const double longest_tail = (parts_ & ECHOSPLINE_TAIL) ? larger(0.0, (n.specular + n.ring_down - FAINT) / n.ring_down_loss) : 0.0;
+    const double longest_tail = (parts_ & ECHOSPLINE_TAIL) ? larger(0.0, (n.specular + n.ring_down - TAIL_END) / n.ring_down_loss) : 0.0;
     double first, last;
     if (!visible(extent, REACH * widest + n.diameter + longest_tail, pad, first, last)) return;
 
@@ -370,7 +370,7 @@ class NeedleEcho {
       strongest_tail = larger(strongest_tail, knots[k].tail);
     }
     knots[KNOTS] = knots[KNOTS - 1];
-    tail_length_ = float((strongest_tail - FAINT) / n.ring_down_loss);
+    tail_length_ = float((strongest_tail - TAIL_END) / n.ring_down_loss);
     rings_ = (parts_ & ECHOSPLINE_TAIL) && tail_length_ > 0.3f;
 
     footprint_.radius = REACH * widest + radius_;
@@ -459,9 +459,9 @@ class NeedleEcho {
       const int at = smaller(int(t / GRAIN), NOISE_COUNT / 3 - 1);
       const float wave = 0.5f + 0.5f * __builtin_cosf(6.2831853f * (t / COMB + 0.22f * shift[at]));
       const float comb = (0.5f + 0.5f * wave * wave) * __builtin_expf(0.25f * height[at]), rise = smaller(1.0f, t / 0.3f);
-      ring[k] = k < TAIL_COUNT ? rise * comb * comb * decibels(-n.ring_down_loss * t) : 0.0f;
+      const float left = larger(0.0f, 1 - t / tail_length_), end = smaller(1.0f, 4 * left);  // fades out over its last quarter
+      ring[k] = rise * end * comb * comb * decibels(-n.ring_down_loss * t);
     }
-    ring[TAIL_COUNT - 1] = 0;
   }
 
   EchoTables& tables_;

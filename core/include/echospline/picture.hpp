@@ -27,10 +27,10 @@ class Picture {
     o_ = options;
     columns_ = o_.columns, rows_ = o_.rows, channels_ = o_.channels;
     white_ = o_.white > 0 ? float(o_.white) : full_scale(o_.pixel_type);
-    room_ = rounded_up(columns_, LANES) + LANES;
-    // lattice points reach beyond the last pixel
-    cell_columns_ = (columns_ - 1) / LATTICE + 1, cell_rows_ = (rows_ - 1) / LATTICE + 1;
-    lattice_room_ = rounded_up(cell_columns_ + 1, LANES) + 2 * LANES;
+    room_ = rounded_up(columns_, LATTICE * LANES) + LANES;
+    raster_ = Raster::of(LATTICE, columns_, rows_);
+    cell_columns_ = larger(1, raster_.columns - 1), cell_rows_ = larger(1, raster_.rows - 1);
+    lattice_room_ = rounded_up(cell_columns_ + 1, LANES) + 4 * LANES;  // margins: LANES before a row, and more behind it
     const int64_t pixel_count = int64_t(columns_) * rows_;
     const bool bytes = o_.pixel_type == ECHOSPLINE_UINT8;
     Mesh& m = mesh_;
@@ -41,10 +41,10 @@ class Picture {
     exact_ = o_.method == ECHOSPLINE_METHOD_EXACT || (o_.method == ECHOSPLINE_METHOD_AUTO && (m.hx < LATTICE || m.hy < LATTICE));
 
     const bool there = ux_.reserve((m.ny + 1) * m.stride) && uy_.reserve((m.ny + 1) * m.stride) && x_.reserve(rows_ * room_) &&
-                       y_.reserve(rows_ * room_) && lattice_x_.reserve((cell_rows_ + 1) * lattice_room_) &&
-                       lattice_y_.reserve((cell_rows_ + 1) * lattice_room_) && marks_.reserve(cell_rows_ * lattice_room_) &&
-                       row_.reserve(4 * lattice_room_ + 2 * room_) && values_.reserve(3 * room_) &&
-                       shade_row_.reserve(2 * (room_ + LANES)) && noise_.reserve() && tables_.reserve() &&
+                       y_.reserve(rows_ * room_) && lattice_x_.reserve((cell_rows_ + 4) * lattice_room_) &&
+                       lattice_y_.reserve((cell_rows_ + 4) * lattice_room_) && marks_.reserve(cell_rows_ * lattice_room_ + 8) &&
+                       row_.reserve(2 * (room_ + LATTICE * LANES)) && values_.reserve(3 * room_ + 4 * LANES) &&
+                       true && noise_.reserve() && tables_.reserve() &&
                        (bytes ? words_.reserve(channels_ * pixel_count)
                               : planes_.reserve(channels_ * int64_t(columns_ + 1) * (rows_ + 1)));
     if (!there) return false;
@@ -121,7 +121,7 @@ class Picture {
       report.residual = residual_of(mesh_, pixels()), report.difference = 0, report.exact_share = 1;
     } else {
       trace_lattice();
-      report.residual = check_.residual, report.difference = check_.difference;
+      report.residual = residual_of(mesh_, lattice(), marks(), raster_), report.difference = check_.difference;
       report.exact_share = double(check_.marked) / (double(cell_columns_) * cell_rows_);
     }
   }
@@ -145,13 +145,18 @@ class Picture {
 
  private:
   Positions pixels() { return {x_.data(), y_.data(), columns_, rows_, room_}; }
-  Positions lattice() { return {lattice_x_.data(), lattice_y_.data(), cell_columns_ + 1, cell_rows_ + 1, lattice_room_}; }
+  /// Lattice points; a margin that is nowhere lies around them.
+  Positions lattice() {
+    const int64_t first = lattice_room_ + LANES;
+    return {lattice_x_.data() + first, lattice_y_.data() + first, cell_columns_ + 1, cell_rows_ + 1, lattice_room_};
+  }
+  Marks marks() { return {marks_.data(), cell_columns_, cell_rows_, lattice_room_}; }
 
   /// Trace every pixel back.
   void trace_pixels() {
     if (traced_) return;
     set_nowhere(x_.data(), x_.size()), set_nowhere(y_.data(), y_.size());
-    trace(mesh_, 1, nullptr, pixels());
+    trace(mesh_, Raster::of(1, columns_, rows_), nullptr, pixels());
     traced_ = true;
   }
 
@@ -159,51 +164,67 @@ class Picture {
   void trace_lattice() {
     if (latticed_) return;
     set_nowhere(lattice_x_.data(), lattice_x_.size()), set_nowhere(lattice_y_.data(), lattice_y_.size());
-    trace(mesh_, LATTICE, nullptr, lattice());
-    Marks marks = {marks_.data(), cell_columns_, cell_rows_, lattice_room_};
-    check_ = mark_cells(mesh_, lattice(), marks);
-    const Folds folds = find_folds(mesh_);
-    if (folds.cells) check_.marked += mark_folds(mesh_, marks);
+    const Positions points = lattice();
+    trace(mesh_, raster_, nullptr, points);
+    extend(points.x, points.stride), extend(points.y, points.stride);
+    Marks bad = marks();
+    check_ = mark_cells(points, bad);
+    const Raster every_pixel = Raster::of(1, columns_, rows_);
+    if (find_folds(mesh_).cells) check_.marked += mark_folds(mesh_, every_pixel, bad);
     if (check_.marked && !traced_) {
-      for (int row = 0; row < rows_; ++row) {
-        const uint8_t* mark = marks.at + row / LATTICE * marks.stride;
-        for (int k = 0; k < cell_columns_; ++k)
-          if (mark[k]) {
-            set_nowhere(x_.data() + row * room_ + k * LATTICE, LATTICE);
-            set_nowhere(y_.data() + row * room_ + k * LATTICE, LATTICE);
-          }
-      }
-      trace(mesh_, 1, &marks, pixels());
+      for (int row = 0; row < rows_; ++row)
+        each_marked_run(row, [&](int first, int count) {
+          set_nowhere(x_.data() + row * room_ + first, count), set_nowhere(y_.data() + row * room_ + first, count);
+        });
+      trace(mesh_, every_pixel, &bad, pixels());
     }
     latticed_ = true;
+  }
+  /// The last points were traced at the last pixels, which may be less than a step away: move them on to a whole step.
+  void extend(float* p, int64_t stride) const {
+    const int across = raster_.last_column - (cell_columns_ - 1) * LATTICE, down = raster_.last_row - (cell_rows_ - 1) * LATTICE;
+    for (int row = 0; row < raster_.rows && across < LATTICE; ++row) {
+      float* last = p + row * stride + cell_columns_;
+      if (across == 0) last[0] = last[-1];
+      else last[0] = last[-1] + (last[0] - last[-1]) * (float(LATTICE) / across);
+    }
+    float *last = p + cell_rows_ * stride, *before = last - stride;
+    for (int k = 0; k <= cell_columns_ && down < LATTICE; ++k) {
+      if (down == 0) last[k] = before[k];
+      else last[k] = before[k] + (last[k] - before[k]) * (float(LATTICE) / down);
+    }
+  }
+  /// Call `visit` with the first pixel and the number of pixels of each marked lattice cell of a row of pixels.
+  template <class Visit>
+  ECHOSPLINE_INLINE void each_marked_run(int row, Visit visit) const {
+    const uint8_t* mark = marks_.data() + smaller(row / LATTICE, cell_rows_ - 1) * lattice_room_;
+    for (int k = 0; k < cell_columns_; k += 8) {
+      uint64_t eight;
+      std::memcpy(&eight, mark + k, sizeof eight);
+      if (!eight) continue;
+      for (int n = k; n < smaller(k + 8, cell_columns_); ++n)
+        if (mark[n]) visit(n * LATTICE, n == cell_columns_ - 1 ? columns_ - n * LATTICE : LATTICE);
+    }
   }
 
   /// Positions of a row's pixels between the lattice points, then those of marked cells from the map.
   void interpolate_row(int row, float* x, float* y) {
-    const int band = row / LATTICE;
-    const float f = (row % LATTICE) * (1.0f / LATTICE);
-    const float *x0 = lattice_x_.data() + band * lattice_room_, *y0 = lattice_y_.data() + band * lattice_room_;
-    float *ax = row_.data(), *ay = ax + lattice_room_, *bx = ay + lattice_room_, *by = bx + lattice_room_;
-    for (int k = 0; k <= cell_columns_; k += LANES) {
-      store(ax + k, load(x0 + k) + f * (load(x0 + lattice_room_ + k) - load(x0 + k)));
-      store(ay + k, load(y0 + k) + f * (load(y0 + lattice_room_ + k) - load(y0 + k)));
+    const Positions points = lattice();
+    const int band = smaller(row / LATTICE, cell_rows_ - 1);
+    const float f = (row - band * LATTICE) * (1.0f / LATTICE);
+    interpolate_line(points.x + band * points.stride, f, x), interpolate_line(points.y + band * points.stride, f, y);
+    const float *exact_x = x_.data() + row * room_, *exact_y = y_.data() + row * room_;
+    each_marked_run(row, [&](int first, int count) __attribute__((always_inline)) {
+      for (int k = first; k < first + count; ++k) x[k] = exact_x[k], y[k] = exact_y[k];
+    });
+  }
+  ECHOSPLINE_INLINE void interpolate_line(const float* above, float f, float* out) const {
+    const float* below = above + lattice_room_;
+    for (int k = 0; k * LATTICE < columns_; k += LANES) {
+      const Floats a = load(above + k), b = load(above + k + 1);
+      const Floats from = a + f * (load(below + k) - a), to = b + f * (load(below + k + 1) - b);
+      spread_line<LATTICE>(from, to - from, [&](int part, Floats v) __attribute__((always_inline)) { store(out + k * LATTICE + part * LANES, v); });
     }
-    for (int k = 0; k < cell_columns_; k += LANES) {
-      store(bx + k, load(ax + k + 1) - load(ax + k));
-      store(by + k, load(ay + k + 1) - load(ay + k));
-    }
-    const Floats part = to_floats(counting() & (LATTICE - 1)) * (1.0f / LATTICE);
-    for (int k = 0; k < columns_; k += LANES) {
-      const int at = k / LATTICE;
-      store(x + k, spread<LATTICE>(ax + at) + part * spread<LATTICE>(bx + at));
-      store(y + k, spread<LATTICE>(ay + at) + part * spread<LATTICE>(by + at));
-    }
-    const uint8_t* mark = marks_.data() + band * lattice_room_;
-    for (int k = 0; k < cell_columns_; ++k)
-      if (mark[k]) {
-        std::memcpy(x + k * LATTICE, x_.data() + row * room_ + k * LATTICE, LATTICE * sizeof(float));
-        std::memcpy(y + k * LATTICE, y_.data() + row * room_ + k * LATTICE, LATTICE * sizeof(float));
-      }
   }
 
   /// Grey levels that the shadow takes away, at lattice points.
@@ -230,22 +251,21 @@ class Picture {
     if (first > last) return;
     const float f = (row % STEP) * (1.0f / STEP);
     const float *a = shade_.data() + band * shade_room_, *b = a + shade_room_;
-    float *low = shade_row_.data(), *rise = low + shade_room_;
-    const int begin = first / LANES * LANES;
-    for (int k = begin; k <= last + 1; k += LANES) store(low + k, load(a + k) + f * (load(b + k) - load(a + k)));
-    for (int k = begin; k <= last; k += LANES) store(rise + k, load(low + k + 1) - load(low + k));
-    const Floats part = to_floats(counting() & (STEP - 1)) * (1.0f / STEP);
-    const int end = smaller((last + 1) * STEP, columns_);
-    for (int c = 0; c < channels_; ++c)
-      for (int k = begin * STEP; k < end; k += LANES) {
-        const Floats v = load(values + c * room_ + k);
-        const Floats loss = spread<STEP>(low + k / STEP) + part * spread<STEP>(rise + k / STEP);
-        store(values + c * room_ + k, greatest(v + loss, least(v, all(0.0f))));
-      }
+    for (int k = first / LANES * LANES; k <= last && k * STEP < columns_; k += LANES) {
+      const Floats here = load(a + k), next = load(a + k + 1);
+      const Floats from = here + f * (load(b + k) - here), to = next + f * (load(b + k + 1) - next);
+      spread_line<STEP>(from, to - from, [&](int part, Floats loss) __attribute__((always_inline)) {
+        for (int c = 0; c < channels_; ++c) {
+          float* at = values + c * room_ + k * STEP + part * LANES;
+          const Floats v = load(at);
+          store(at, greatest(v + loss, least(v, all(0.0f))));
+        }
+      });
+    }
   }
 
   /// Shadow and echo of a row; with `tissue`, only where it is not NaN.
-  void draw_needle(const NeedleEcho& echo, float range, int row, const float* tissue, float* values) {
+  void draw_needle(const NeedleEcho& __restrict echo, float range, int row, const float* tissue, float* __restrict values) {
     if (shade_step_ == 4) shade_pixels<4>(row, values);
     if (shade_step_ == 2) shade_pixels<2>(row, values);
     if (shade_step_ == 1) shade_pixels<1>(row, values);
@@ -265,7 +285,7 @@ class Picture {
 
   void draw_rows(const NeedleEcho* echo, float range, void* out) {
     const float border = o_.border == ECHOSPLINE_BORDER_TRANSPARENT ? 0.0f : float(o_.border_value);
-    float *room_x = row_.data() + 4 * lattice_room_, *room_y = room_x + room_;
+    float *room_x = row_.data(), *room_y = room_x + room_ + LATTICE * LANES;
     for (int row = 0; row < rows_; ++row) {
       const float *x = x_.data() + row * room_, *y = y_.data() + row * room_;
       if (!exact_) {
@@ -315,6 +335,7 @@ class Picture {
 
   echospline_picture_options o_ = {};
   Mesh mesh_ = {};
+  Raster raster_ = {};
   int columns_ = 0, rows_ = 0, channels_ = 1, cell_columns_ = 1, cell_rows_ = 1, shade_step_ = 4, shade_columns_ = 0, shade_rows_ = 0;
   int64_t room_ = 0, lattice_room_ = 0, shade_room_ = 0;
   float white_ = 255;
@@ -324,7 +345,7 @@ class Picture {
   Array<float> x_, y_;                       // exact map: of every pixel, or of those in marked cells
   Array<float> lattice_x_, lattice_y_;
   Array<uint8_t> marks_;
-  Array<float> row_, values_, shade_row_;    // of the row that is drawn
+  Array<float> row_, values_;    // of the row that is drawn
   Array<float> shade_;
   Array<Reach> shaded_;
   Array<uint32_t> words_;                    // reference: 8-bit pixels

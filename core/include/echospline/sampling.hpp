@@ -117,9 +117,7 @@ ECHOSPLINE_INLINE Pixel pixel_of(float value) {
 inline void write_row(const float* values, int columns, uint8_t* out) {
   int k = 0;
   for (; k + LANES <= columns; k += LANES) {
-    const Ints v = to_ints(within(load(values + k), 0.0f, 255.0f) + 0.5f);
-    const LaneBytes bytes = __builtin_convertvector(v, LaneBytes);
-    std::memcpy(out + k, &bytes, sizeof bytes);
+    store_bytes(out + k, to_ints(within(load(values + k), 0.0f, 255.0f) + 0.5f));
   }
   for (; k < columns; ++k) out[k] = pixel_of<uint8_t>(values[k]);
 }
