@@ -171,12 +171,12 @@ void echospline_needle_defaults(echospline_needle* needle) {
   needle->steering = 12;
   needle->roughness = -25;        // with the roll-off: contrast measured in gel at 35 to 60 and at 60 to 90 degrees
   needle->rolloff = 9;
-  needle->wobble = 2;
-  needle->patches = 4;
+  needle->wobble = 2.5;
+  needle->patches = 5;
   needle->bevel = -3;
-  needle->ring_down = -20;
+  needle->ring_down = -24;
   needle->ring_down_loss = 5;
-  needle->opacity = 0.6;
+  needle->opacity = 0.75;
 }
 
 echospline_status echospline_picture_create(const echospline_picture_options* options, const void* pixels, echospline_picture** picture) {

@@ -25,6 +25,8 @@ constexpr float REACH = 4.2f;            // sigmas at which exp(-q) is 77 dB dow
 constexpr float TAIL_END = -55.0f;       // dB at which the ring-down ends: below the tissue, and each millimetre more costs time
 constexpr float COMB = 0.34f;            // mm between rungs of the tail: 0.27 diameters of an 18-gauge needle with its stylet
 constexpr float BEVEL_LENGTH = 1.8f;     // diameters
+constexpr float ROUND = 10.0f;           // dB more grain from a shaft across the plane: its round near side lies in one resolution cell
+constexpr float BEVEL_LOSS = 12.0f;      // dB of the mirror echo lost on the bevel, which faces elsewhere: the line ends at the heel
 constexpr float HEEL = 12.0f;            // dB by which the heel is weaker than the tip
 constexpr float ONSET = 0.8f;            // mm below the shaft at which half of the shadow has set in: no hard black edge
 constexpr float GROUND = 0.05f;          // mm: rays are followed up from this far above a pixel
@@ -32,7 +34,7 @@ constexpr float GROUND = 0.05f;          // mm: rays are followed up from this f
 /// The grain of a needle.
 struct Noise {
   Array<float> real[LOOKS], imaginary[LOOKS];  // white, unit power
-  Array<float> slow, patch;                    // Gaussian of unit sd with a length of 5 and 0.6 mm
+  Array<float> slow, patch;                    // Gaussian of unit sd, changing over 2 and 0.3 mm
   uint32_t seed = 0;
   bool made = false;
 
@@ -50,8 +52,8 @@ struct Noise {
       fill(real[k].data(), state, 0.70710678f);
       fill(imaginary[k].data(), state, 0.70710678f);
     }
-    smoothed(slow.data(), state, 5.0f / GRAIN);
-    smoothed(patch.data(), state, 0.6f / GRAIN);
+    smoothed(slow.data(), state, 2.0f / GRAIN);
+    smoothed(patch.data(), state, 0.3f / GRAIN);
   }
 
  private:
@@ -158,24 +160,32 @@ class NeedleEcho {
     spread_ = float(0.42 * needle.element_height), steepest_ = float(0.5 / needle.f_number), opacity_ = float(needle.opacity);
     ux_ = float(u_[0]), uy_ = float(u_[1]), uz_ = float(u_[2]);
     ex_ = float(entry_[0]), ey_ = float(entry_[1]), ez_ = float(entry_[2]);
-    tip_power_ = arrival_ * decibels(needle.bevel);
+    spot_power_[0] = arrival_ * decibels(needle.bevel);
     const double heel = BEVEL_LENGTH * needle.diameter;
-    heel_power_ = tip_power_ * decibels(-HEEL) * float(larger(0.0, smaller(1.0, length_ / heel - 1)));
+    spot_power_[1] = spot_power_[0] * decibels(-HEEL) * float(larger(0.0, smaller(1.0, length_ / heel - 1)));
     for (int k = 0; k < 3; ++k) {
-      tip_[k] = float(entry_[k] + (length_ - smaller(0.15, length_)) * u_[k]);
-      heel_[k] = float(entry_[k] + (length_ - smaller(heel, length_)) * u_[k]);
+      spot_[0][k] = float(entry_[k] + (length_ - smaller(0.15, length_)) * u_[k]);
+      spot_[1][k] = float(entry_[k] + (length_ - smaller(heel, length_)) * u_[k]);
     }
+    // the heel lies on the near wall
+    double wall[2];
+    near_wall(spot_[1][0], spot_[1][1], wall);
+    spot_[1][0] += float(wall[0]), spot_[1][1] += float(wall[1]);
+    spot_reach_ = REACH * larger(needle.lateral, needle.axial);
     tabulate(needle, extent, noise);
   }
 
   const Footprint& footprint() const { return footprint_; }
   bool shades() const { return (parts_ & ECHOSPLINE_SHADOW) && opacity_ > 0; }
 
-  /// Power relative to white at points in mm.
-  ECHOSPLINE_INLINE Floats power(Floats x, Floats y) const {
-    if (!footprint_.count) return Floats{};
-    return curved_ ? power_in<true>(x, y) : power_in<false>(x, y);
-  }
+  /// Power of shaft and tail relative to white, at points in mm; 0 outside the footprint.
+  ECHOSPLINE_INLINE Floats line(Floats x, Floats y) const { return curved_ ? line_in<true>(x, y) : line_in<false>(x, y); }
+  /// Power of the tip (0) or the heel (1); 0 further than `spot_reach` away.
+  ECHOSPLINE_INLINE Floats spot(int k, Floats x, Floats y) const { return curved_ ? spot_in<true>(k, x, y) : spot_in<false>(k, x, y); }
+  int spots() const { return (parts_ & ECHOSPLINE_BEVEL) ? 2 : 0; }
+  double spot_x(int k) const { return spot_[k][0]; }
+  double spot_y(int k) const { return spot_[k][1]; }
+  double spot_reach() const { return spot_reach_; }
   /// Logarithm of the tissue's power that passes, dB (0 or less).
   ECHOSPLINE_INLINE Floats shade(Floats x, Floats y) const {
     return curved_ ? shade_in<true>(x, y) : shade_in<false>(x, y);
@@ -184,6 +194,21 @@ class NeedleEcho {
  private:
   static float decibels(double level) { return float(__builtin_pow(10.0, 0.1 * level)); }
 
+  /// Direction of the beam at a place, and how deep that is.
+  struct Beam {
+    double x, y, depth;
+  };
+  Beam beam_at(double x, double y) const {
+    if (!curved_) return {0, 1, y};
+    const double dx = x - apex_[0], dy = y - apex_[1], distance = larger(1e-6, __builtin_sqrt(dx * dx + dy * dy));
+    return {dx / distance, dy / distance, distance - face_};
+  }
+  /// From the axis to the near wall within the plane: a radius against the beam, at right angles to the needle.
+  void near_wall(double x, double y, double* shift) const {
+    const Beam beam = beam_at(x, y);
+    const double along = beam.x * u_[0] + beam.y * u_[1];
+    shift[0] = -radius_ * (beam.x - along * u_[0]), shift[1] = -radius_ * (beam.y - along * u_[1]);
+  }
   /// The needle from a pixel, in axes across the beam (l) and along it (a).
   struct View {
     Floats ul, ua, rl, ra, depth, bx, by;
@@ -222,45 +247,40 @@ class NeedleEcho {
   }
 
   template <bool CURVED>
-  ECHOSPLINE_INLINE Floats power_in(Floats x, Floats y) const {
+  ECHOSPLINE_INLINE Floats line_in(Floats x, Floats y) const {
     const View v = view<CURVED>(x, y);
     const Floats qe = 1.0f / slice_square(v.depth);
     Floats power = Floats{};
-    if (parts_ & (ECHOSPLINE_SHAFT | ECHOSPLINE_TAIL)) {
-      // the near wall: the axis shifted by a radius against the beam, at right angles to the needle
-      const float radius = float(radius_);
-      const Floats shift = radius * v.ua, rl = v.rl - shift * v.ul, ra = v.ra + radius - shift * v.ua, rz = -ez_ - shift * uz_;
-      const Floats along_l = ql_ * v.ul * v.ul, along_z = qe * (uz_ * uz_), uqu = along_l + qa_ * v.ua * v.ua + along_z;
-      const Floats per = 1.0f / uqu, s = (ql_ * rl * v.ul + qa_ * ra * v.ua + qe * rz * uz_) * per;
-      const Floats la = rl * v.ua - ra * v.ul, lz = rl * uz_ - rz * v.ul, az = ra * uz_ - rz * v.ua;
-      const Floats q = (ql_ * qa_ * la * la + qe * (ql_ * lz * lz + qa_ * az * az)) * per;  // rQr - (rQu)^2 / uQu
-      if ((parts_ & ECHOSPLINE_SHAFT) && any(q < REACH * REACH)) power += exp_minus(q) * along(tables_.profile.data(), s);
-      if (rings_) {
-        // the line shifted down the beam by the t that brings it nearest to the pixel
-        const Floats a = qa_ * (along_l + along_z) * per, b = qa_ * (ra - s * v.ua);
-        const Floats t = greatest(b / greatest(a, all(1e-3f * qa_)), all(0.0f));
-        if (any(t < tail_length_)) {
-          const Floats k = least(t * per_ring_, all(float(TAIL_COUNT - 1)));
-          const Ints i = to_ints(k);
-          const Floats low = gather(tables_.ring_down.data(), i), high = gather(tables_.ring_down.data() + 1, i);
-          const Floats off = greatest(q - t * (2.0f * b - a * t), all(0.0f));
-          power += (low + (k - to_floats(i)) * (high - low)) * exp_minus(off) * along(tables_.tail_profile.data(), s - t * qa_ * v.ua * per);
-        }
+    // the near wall: the axis shifted by a radius against the beam, at right angles to the needle
+    const float radius = float(radius_);
+    const Floats shift = radius * v.ua, rl = v.rl - shift * v.ul, ra = v.ra + radius - shift * v.ua, rz = -ez_ - shift * uz_;
+    const Floats along_l = ql_ * v.ul * v.ul, along_z = qe * (uz_ * uz_), uqu = along_l + qa_ * v.ua * v.ua + along_z;
+    const Floats per = 1.0f / uqu, s = (ql_ * rl * v.ul + qa_ * ra * v.ua + qe * rz * uz_) * per;
+    const Floats la = rl * v.ua - ra * v.ul, lz = rl * uz_ - rz * v.ul, az = ra * uz_ - rz * v.ua;
+    const Floats q = (ql_ * qa_ * la * la + qe * (ql_ * lz * lz + qa_ * az * az)) * per;  // rQr - (rQu)^2 / uQu
+    if ((parts_ & ECHOSPLINE_SHAFT) && any(q < REACH * REACH)) power += exp_minus(q) * along(tables_.profile.data(), s);
+    if (rings_) {
+      // the line shifted down the beam by the t that brings it nearest to the pixel
+      const Floats a = qa_ * (along_l + along_z) * per, b = qa_ * (ra - s * v.ua);
+      const Floats t = greatest(b / greatest(a, all(1e-3f * qa_)), all(0.0f));
+      if (any(t < tail_length_)) {
+        const Floats k = least(t * per_ring_, all(float(TAIL_COUNT - 1)));
+        const Ints i = to_ints(k);
+        const Floats low = gather(tables_.ring_down.data(), i), high = gather(tables_.ring_down.data() + 1, i);
+        const Floats off = greatest(q - t * (2.0f * b - a * t), all(0.0f));
+        power += (low + (k - to_floats(i)) * (high - low)) * exp_minus(off) * along(tables_.tail_profile.data(), s - t * qa_ * v.ua * per);
       }
-    }
-    if (parts_ & ECHOSPLINE_BEVEL) {
-      power += spot<CURVED>(x, y, v, qe, tip_, tip_power_);
-      power += spot<CURVED>(x, y, v, qe, heel_, heel_power_);
     }
     return power;
   }
   template <bool CURVED>
-  ECHOSPLINE_INLINE Floats spot(Floats x, Floats y, const View& v, Floats qe, const float* at, float power) const {
+  ECHOSPLINE_INLINE Floats spot_in(int k, Floats x, Floats y) const {
+    const View v = view<CURVED>(x, y);
+    const float* at = spot_[k];
     const Floats dx = x - at[0], dy = y - at[1];
     Floats l = dx, a = dy;
     if constexpr (CURVED) l = v.by * dx - v.bx * dy, a = v.bx * dx + v.by * dy;
-    const Floats q = ql_ * l * l + qa_ * a * a + qe * (at[2] * at[2]);
-    return any(q < REACH * REACH) ? power * exp_minus(q) : Floats{};
+    return spot_power_[k] * exp_minus(ql_ * l * l + qa_ * a * a + at[2] * at[2] / slice_square(v.depth));
   }
 
   /// The share of the rays between a pixel and its aperture that the shaft blocks, times the share of the slice that it covers.
@@ -310,14 +330,9 @@ class NeedleEcho {
   };
   Knot knot_at(const echospline_needle& n, double s) const {
     constexpr double degree = 57.29577951308232;
-    const double x = entry_[0] + s * u_[0], y = entry_[1] + s * u_[1];
-    double bx = 0, by = 1, depth = y;
-    if (curved_) {
-      const double dx = x - apex_[0], dy = y - apex_[1], distance = larger(1e-6, __builtin_sqrt(dx * dx + dy * dy));
-      bx = dx / distance, by = dy / distance, depth = distance - face_;
-    }
-    const double ul = by * u_[0] - bx * u_[1], ua = bx * u_[0] + by * u_[1], uz = u_[2];
-    const double slice = slice_at(depth), uqu = ql_ * ul * ul + qa_ * ua * ua + uz * uz / (slice * slice);
+    const Beam beam = beam_at(entry_[0] + s * u_[0], entry_[1] + s * u_[1]);
+    const double ul = beam.y * u_[0] - beam.x * u_[1], ua = beam.x * u_[0] + beam.y * u_[1], uz = u_[2];
+    const double slice = slice_at(beam.depth), uqu = ql_ * ul * ul + qa_ * ua * ua + uz * uz / (slice * slice);
     const double sigma = 1 / __builtin_sqrt(uqu), lateral = n.lateral;
     const double tilt = degree * __builtin_asin(larger(-1.0, smaller(1.0, ua))), flat = larger(1e-9, ul * ul + uz * uz);
     const double width = __builtin_sqrt((ul * ul * n.lobe * n.lobe + uz * uz * n.lobe_elevation * n.lobe_elevation) / flat);
@@ -330,10 +345,10 @@ class NeedleEcho {
     const double step = larger(0.0, smaller(1.0, ((tilt < 0 ? -tilt : tilt) - 50) / 40)), off = tilt / (0.4 * width);
     Knot k;
     k.specular = float(n.specular + 10 * __builtin_log10(mirror + 1e-12) + 20 * __builtin_log10(smaller(1.0, sigma / lateral)));
-    k.rough = float(n.roughness - n.rolloff * step + 10 * __builtin_log10(smaller(1.5, sigma / lateral)));
+    k.rough = float(n.roughness - n.rolloff * step + 10 * __builtin_log10(smaller(1.5, sigma / lateral)) + ROUND * uz * uz);
     k.tail = float(n.specular + n.ring_down - 4.343 * off * off);  // to and fro needs a square hit
     k.sigma = float(sigma);
-    k.steady = float(0.15 + 0.65 * uz * uz);  // across the plane many scatterers share a resolution cell
+    k.steady = float(0.03 + 0.67 * uz * uz);  // across the plane many scatterers share a resolution cell
     return k;
   }
 
@@ -355,7 +370,7 @@ class NeedleEcho {
   }
 
   void tabulate(const echospline_needle& n, const Extent& extent, const Noise& noise) {
-    if (!(parts_ & (ECHOSPLINE_SHAFT | ECHOSPLINE_TAIL | ECHOSPLINE_BEVEL))) return;
+    if (!(parts_ & (ECHOSPLINE_SHAFT | ECHOSPLINE_TAIL))) return;
     const double widest = larger(n.lateral, n.axial), deepest = larger(slice_at(extent.top), slice_at(extent.bottom));
     const double pad = 5 * larger(widest, u_[2] * u_[2] > 1e-4 ? deepest : 0.0);
     const double longest_tail = (parts_ & ECHOSPLINE_TAIL) ? larger(0.0, (n.specular + n.ring_down - TAIL_END) / n.ring_down_loss) : 0.0;
@@ -373,18 +388,20 @@ class NeedleEcho {
     tail_length_ = float((strongest_tail - TAIL_END) / n.ring_down_loss);
     rings_ = (parts_ & ECHOSPLINE_TAIL) && tail_length_ > 0.3f;
 
-    footprint_.radius = REACH * widest + radius_;
+    // half width of the line across the needle, as it lies in the plane
+    const double flat = __builtin_sqrt(u_[0] * u_[0] + u_[1] * u_[1]);
+    double finest = 1e9;
+    for (int k = 0; k < KNOTS; ++k) finest = smaller(finest, double(knots[k].sigma));
+    footprint_.radius = REACH * smaller(widest, n.lateral * n.axial / (finest * larger(flat, 1e-6))) + (curved_ ? 0.2 * radius_ : 0.0);
     for (int side = 0; side < 2; ++side) {
       const double s = side ? last : first;
-      const double x = entry_[0] + s * u_[0], y = entry_[1] + s * u_[1];
+      double x = entry_[0] + s * u_[0], y = entry_[1] + s * u_[1], wall[2];
+      near_wall(x, y, wall);
+      x += wall[0], y += wall[1];
       footprint_.add(x, y);
       if (!rings_) continue;
-      double bx = 0, by = 1;
-      if (curved_) {
-        const double dx = x - apex_[0], dy = y - apex_[1], distance = larger(1e-6, __builtin_sqrt(dx * dx + dy * dy));
-        bx = dx / distance, by = dy / distance;
-      }
-      footprint_.add(x + tail_length_ * bx, y + tail_length_ * by);
+      const Beam beam = beam_at(x, y);
+      footprint_.add(x + tail_length_ * beam.x, y + tail_length_ * beam.y);
     }
 
     // entries at whole multiples of the step from the tip, so that they find the same grain wherever the needle is
@@ -434,9 +451,10 @@ class NeedleEcho {
       const Floats per_sigma = 0.70710678f / sigma;
       const Floats end = 0.5f * (error_function(s * per_sigma) - error_function((s - length) * per_sigma));
       const Floats shown = end * end * slow;
+      const Floats within_shaft = smooth_step(s * 0.5f) * smooth_step((length - s) * 0.5f);  // no hard edge of the tail
       // the mirror echo fades over the bevel and towards both ends
       const float bevel = float(BEVEL_LENGTH * n.diameter);
-      const Floats fade = -6.0f * exp_minus(greatest(v, all(0.0f)) * (1.0f / bevel)) - 4.0f * exp_minus(greatest(s, all(0.0f)) * 0.3f);
+      const Floats fade = -BEVEL_LOSS * exp_minus(greatest(v, all(0.0f)) * (1.4f / bevel)) - 4.0f * exp_minus(greatest(s, all(0.0f)) * 0.3f);
       const Floats mirror = power_of(specular + fade), grain = power_of(rough) * (1.0f - steady) * patch * (per_norm * per_norm);
       Floats cross = Floats{}, square = Floats{};
       for (int look = 0; look < LOOKS; ++look)
@@ -444,7 +462,7 @@ class NeedleEcho {
       cross *= 1.0f / LOOKS, square *= 1.0f / LOOKS;
       const Floats line = mirror + 2.0f * root(mirror * grain) * cross + grain * square + power_of(rough) * steady;
       store(tables_.profile.data() + k, shown * greatest(line, all(0.0f)));
-      store(tables_.tail_profile.data() + k, shown * power_of(tail + fade) * (0.4f + 0.6f * square * (per_norm * per_norm)));
+      store(tables_.tail_profile.data() + k, slow * within_shaft * power_of(tail + fade));
     }
     if (rings_) tabulate_ring_down(n, noise);
   }
@@ -457,8 +475,8 @@ class NeedleEcho {
     for (int k = 0; k < TAIL_COUNT + LANES; ++k) {
       const float t = k / per_ring_;
       const int at = smaller(int(t / GRAIN), NOISE_COUNT / 3 - 1);
-      const float wave = 0.5f + 0.5f * __builtin_cosf(6.2831853f * (t / COMB + 0.22f * shift[at]));
-      const float comb = (0.5f + 0.5f * wave * wave) * __builtin_expf(0.25f * height[at]), rise = smaller(1.0f, t / 0.3f);
+      const float wave = 0.5f + 0.5f * __builtin_cosf(6.2831853f * (t / COMB + 0.4f * shift[at]));
+      const float comb = (0.6f + 0.4f * wave * wave) * __builtin_expf(0.35f * height[at]), rise = smaller(1.0f, t / 0.3f);
       const float left = larger(0.0f, 1 - t / tail_length_), end = smaller(1.0f, 4 * left);  // fades out over its last quarter
       ring[k] = rise * end * comb * comb * decibels(-n.ring_down_loss * t);
     }
@@ -469,7 +487,8 @@ class NeedleEcho {
   uint32_t parts_ = 0;
   double entry_[3], u_[3], length_ = 0, apex_[2] = {}, face_ = 0, radius_ = 0;
   float ql_ = 0, qa_ = 0, elevation_ = 0, elevation_depth_ = 0, spread_ = 0, steepest_ = 1, opacity_ = 0, arrival_ = 0;
-  float ux_ = 0, uy_ = 0, uz_ = 0, ex_ = 0, ey_ = 0, ez_ = 0, tip_power_ = 0, heel_power_ = 0, tip_[3] = {}, heel_[3] = {};
+  float ux_ = 0, uy_ = 0, uz_ = 0, ex_ = 0, ey_ = 0, ez_ = 0, spot_[2][3] = {}, spot_power_[2] = {};
+  double spot_reach_ = 0;
   float tail_length_ = 0, per_ring_ = 0, first_ = 0, per_step_ = 0;
   int count_ = 1;
   Footprint footprint_;

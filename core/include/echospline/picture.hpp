@@ -138,7 +138,9 @@ class Picture {
       const int held = int(smaller<int64_t>(LANES, count - k));
       Floats x = Floats{}, y = Floats{};
       for (int lane = 0; lane < held; ++lane) x[lane] = float(points[2 * (k + lane)]), y[lane] = float(points[2 * (k + lane) + 1]);
-      const Floats light = echo.power(x, y), passed = echo.shades() ? power_of(echo.shade(x, y)) : all(1.0f);
+      Floats light = echo.footprint().count ? echo.line(x, y) : Floats{};
+      for (int spot = 0; spot < echo.spots(); ++spot) light += echo.spot(spot, x, y);
+      const Floats passed = echo.shades() ? power_of(echo.shade(x, y)) : all(1.0f);
       for (int lane = 0; lane < held; ++lane) power[k + lane] = light[lane], transmission[k + lane] = passed[lane];
     }
   }
@@ -271,12 +273,22 @@ class Picture {
     if (shade_step_ == 1) shade_pixels<1>(row, values);
     const double y = o_.origin[1] + row * o_.spacing[1];
     double first, last;
-    if (!echo.footprint().interval(y, first, last)) return;
-    first = (first - o_.origin[0]) / o_.spacing[0], last = (last - o_.origin[0]) / o_.spacing[0];
-    const int begin = int(larger(0.0, smaller(first, double(columns_)))), end = int(larger(0.0, smaller(last + 1, double(columns_))));
+    if (echo.footprint().interval(y, first, last))
+      add_power(first, last, range, tissue, values, [&](Floats x) __attribute__((always_inline)) { return echo.line(x, all(float(y))); });
+    const double reach = echo.spot_reach();
+    for (int k = 0; k < echo.spots(); ++k)
+      if (y > echo.spot_y(k) - reach && y < echo.spot_y(k) + reach)
+        add_power(echo.spot_x(k) - reach, echo.spot_x(k) + reach, range, tissue, values,
+                  [&](Floats x) __attribute__((always_inline)) { return echo.spot(k, x, all(float(y))); });
+  }
+  /// Add the power between two places of a row, mm, to its values.
+  template <class Power>
+  ECHOSPLINE_INLINE void add_power(double first, double last, float range, const float* tissue, float* __restrict values, Power power_at) {
+    const double per = 1 / o_.spacing[0];
+    const int begin = int(larger(0.0, smaller((first - o_.origin[0]) * per, double(columns_))));
+    const int end = int(larger(0.0, smaller((last - o_.origin[0]) * per + 1, double(columns_))));
     for (int k = begin; k < end; k += LANES) {
-      const Floats x = float(o_.origin[0]) + (counted() + float(k)) * float(o_.spacing[0]);
-      Floats power = echo.power(x, all(float(y)));
+      Floats power = power_at(float(o_.origin[0]) + (counted() + float(k)) * float(o_.spacing[0]));
       if (tissue) power = pick(load(tissue + k) == load(tissue + k), power, Floats{});
       if (!any(power > 1e-8f)) continue;
       for (int c = 0; c < channels_; ++c) store(values + c * room_ + k, with_echo(load(values + c * room_ + k), power, white_, range));
