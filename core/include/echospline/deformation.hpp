@@ -49,7 +49,7 @@ ECHOSPLINE_INLINE void invert(Number bx, Number by, Number cx, Number cy, Number
   // (q - t c) x (b + t d) = 0, that is A t^2 + B t + C = 0
   const Number A = cx * dy - cy * dx;
   const Floats B = (cx * by - cy * bx) - (qx * dy - qy * dx), C = qy * bx - qx * by;
-  const Floats r = root(greatest(B * B - 4.0f * A * C, all(0.0f)));
+  const Floats r = root(B * B - 4.0f * A * C);  // not a number, and so in no cell, where the point has no place
   t = 2.0f * C / (float(SIGN) * r - B);
   const Floats ex = bx + t * dx, ey = by + t * dy;
   s = ((qx - t * cx) * ex + (qy - t * cy) * ey) / (ex * ex + ey * ey);
@@ -321,13 +321,14 @@ ECHOSPLINE_INLINE Floats bend(Floats a, Floats b, Floats c, Floats d) {
   const Floats before = magnitude(a - b - (b - c)), after = magnitude(b - c - (c - d));
   return 0.25f * (pick(before == before, before, after) + pick(after == after, after, before));
 }
-/// The same over both directions of a lattice cell; rows from the one above it.
+/// The same over both directions of a lattice cell; not a number where a corner is nowhere.
 ECHOSPLINE_INLINE Floats bend_in_cell(const float* p, int64_t stride) {
   const float* q = p + stride;
   const Floats a = load(p), b = load(p + 1), c = load(q), d = load(q + 1);
   const Floats across = greatest(bend(load(p - 1), a, b, load(p + 2)), bend(load(q - 1), c, d, load(q + 2)));
   const Floats down = greatest(bend(load(p - stride), a, c, load(q + stride)), bend(load(p - stride + 1), b, d, load(q + stride + 1)));
-  return across + down;
+  const Floats corners = a + b + c + d;
+  return pick(corners == corners, across + down, corners);
 }
 
 /// Mark the lattice cells in which interpolation is not good enough.

@@ -47,7 +47,8 @@ struct Noise {
   void make(uint32_t new_seed) {
     if (made && seed == new_seed) return;
     made = true, seed = new_seed;
-    uint64_t state = 0x9e3779b97f4a7c15u * (uint64_t(seed) + 1);
+    uint64_t state = seed, high = next(state);
+    state = high << 32 | next(state);  // far from the states of other seeds
     for (int k = 0; k < LOOKS; ++k) {
       fill(real[k].data(), state, 0.70710678f);
       fill(imaginary[k].data(), state, 0.70710678f);
@@ -154,7 +155,7 @@ class NeedleEcho {
     apex_[0] = needle.apex[0], apex_[1] = needle.apex[1], face_ = curved_ ? larger(0.0, -apex_[1]) : 0.0;
     radius_ = 0.5 * needle.diameter;
     const double growth = smaller(1.0, length_ / needle.diameter);  // the first diameter enters gradually
-    arrival_ = float(growth * growth * (3 - 2 * growth));
+    arrival_ = float(growth * growth * growth * growth);
     ql_ = float(1 / (needle.lateral * needle.lateral)), qa_ = float(1 / (needle.axial * needle.axial));
     elevation_ = float(needle.elevation), elevation_depth_ = float(needle.elevation_depth);
     spread_ = float(0.42 * needle.element_height), steepest_ = float(0.5 / needle.f_number), opacity_ = float(needle.opacity);
@@ -348,7 +349,7 @@ class NeedleEcho {
     k.rough = float(n.roughness - n.rolloff * step + 10 * __builtin_log10(smaller(1.5, sigma / lateral)) + ROUND * uz * uz);
     k.tail = float(n.specular + n.ring_down - 4.343 * off * off);  // to and fro needs a square hit
     k.sigma = float(sigma);
-    k.steady = float(0.03 + 0.67 * uz * uz);  // across the plane many scatterers share a resolution cell
+    k.steady = float(0.03 + 0.9 * uz * uz);  // across the plane many scatterers share a resolution cell
     return k;
   }
 

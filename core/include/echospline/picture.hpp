@@ -239,9 +239,9 @@ class Picture {
       float* shade = shade_.data() + row * shade_room_;
       for (int k = 0; k < shade_columns_; k += LANES) {
         const Floats x = float(o_.origin[0]) + (counted() + float(k)) * float(shade_step_ * o_.spacing[0]);
-        const Floats loss = echo.shade(x, y) * per_decibel;
-        store(shade + k, loss);
-        if (any(loss < -0.01f)) reach.first = smaller(reach.first, k), reach.last = smaller(k + LANES - 1, shade_columns_ - 1);
+        const Floats loss = echo.shade(x, y);
+        store(shade + k, loss * per_decibel);
+        if (any(loss < -0.003f)) reach.first = smaller(reach.first, k), reach.last = smaller(k + LANES - 1, shade_columns_ - 1);
       }
     }
   }
