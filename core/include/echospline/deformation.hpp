@@ -16,7 +16,7 @@ constexpr float LATTICE_LIMIT = 0.1f;   // px by which an interpolated position 
 constexpr float RIM = 0.5f;             // px: a pixel has an area, so tissue reaches half a pixel beyond the mesh's outermost nodes
 constexpr int CHECK_EVERY = 8;          // rows and columns between pixels at which the exact inverse is composed with the forward map
 
-/// Nodes and displacement, in pixels; rows of `stride` numbers, readable LANES beyond their end.
+/// Nodes and displacement, in pixels; rows of `stride` numbers, readable LANES beyond their ends and a row before and after them.
 struct Mesh {
   int nx, ny;
   int64_t stride;
@@ -312,45 +312,79 @@ ECHOSPLINE_INLINE Floats square_misfit_at(const Mesh& m, Floats x, Floats y, Flo
 /// What the lattice left to be traced exactly, and how far the rest is off.
 struct LatticeCheck {
   int64_t marked = 0;
-  float difference = 0;  // px, largest estimated distance of an interpolated position from the exact one
+  float difference = 0;  // px, largest distance of an interpolated position from the exact one that bends of the mesh allow
 };
 
-/// Largest distance between a line through numbers b and c and a curve with a bend in between: a quarter of the second differences there.
-/// A bend is exactly that wide, a parabola half; differences that reach outside the tissue give way to the ones that do not.
-ECHOSPLINE_INLINE Floats bend(Floats a, Floats b, Floats c, Floats d) {
-  const Floats before = magnitude(a - b - (b - c)), after = magnitude(b - c - (c - d));
-  return 0.25f * (pick(before == before, before, after) + pick(after == after, after, before));
+/// Squared bend of the displacement at nodes: its second difference towards `step`.
+ECHOSPLINE_INLINE Floats bend_at(const float* u, const float* v, int64_t step) {
+  const Floats x = (load(u + step) - load(u)) - (load(u) - load(u - step)), y = (load(v + step) - load(v)) - (load(v) - load(v - step));
+  return x * x + y * y;
 }
-/// The same over both directions of a lattice cell; not a number where a corner is nowhere.
-ECHOSPLINE_INLINE Floats bend_in_cell(const float* p, int64_t stride) {
-  const float* q = p + stride;
-  const Floats a = load(p), b = load(p + 1), c = load(q), d = load(q + 1);
-  const Floats across = greatest(bend(load(p - 1), a, b, load(p + 2)), bend(load(q - 1), c, d, load(q + 2)));
-  const Floats down = greatest(bend(load(p - stride), a, c, load(q + stride)), bend(load(p - stride + 1), b, d, load(q + stride + 1)));
-  const Floats corners = a + b + c + d;
-  return pick(corners == corners, across + down, corners);
+/// How far positions between lattice points may be off in LANES cells, px; huge where they fold.
+///
+/// Between lattice points lie l = LATTICE |J^-1| pixels of the reference. Where the gradient jumps by g across an edge of the mesh, the displacement leaves
+/// its chord by at most g l / 4, and by l / 2h times as much where the mesh is finer than that; the position is off by |J^-1| times that.
+ECHOSPLINE_INLINE Floats lattice_error_at(const Mesh& m, int i, int j, const CellLanes& c) {
+  const float *u = m.ux + j * m.stride + i, *v = m.uy + j * m.stride + i;
+  const int64_t down = m.stride;
+  const Ints n = counting() + i;
+  const Floats none = all(0.0f);
+  // the mesh's own edges do not bend
+  const Floats left = pick(n > 0, greatest(bend_at(u, v, 1), bend_at(u + down, v + down, 1)), none);
+  const Floats right = pick(n < m.nx - 2, greatest(bend_at(u + 1, v + 1, 1), bend_at(u + down + 1, v + down + 1, 1)), none);
+  const Floats top = j > 0 ? greatest(bend_at(u, v, down), bend_at(u + 1, v + 1, down)) : none;
+  const Floats bottom = j < m.ny - 2 ? greatest(bend_at(u + down, v + down, down), bend_at(u + down + 1, v + down + 1, down)) : none;
+  const float px = 1.0f / m.hx, py = 1.0f / m.hy;
+  const Floats jump_x = root(greatest(left, right)) * px, jump_y = root(greatest(top, bottom)) * py;
+  // |J^-1|: largest singular value of J over its determinant, at the cell's worst
+  const Floats xx = (c.bx + 0.5f * c.dx) * px, yx = (c.by + 0.5f * c.dy) * px, xy = (c.cx + 0.5f * c.dx) * py, yy = (c.cy + 0.5f * c.dy) * py;
+  const Floats sum_a = xx + yy, sum_b = yx - xy, difference_a = xx - yy, difference_b = yx + xy;
+  const Floats stretch = 0.5f * (root(sum_a * sum_a + sum_b * sum_b) + root(difference_a * difference_a + difference_b * difference_b));
+  const Floats determinant = smallest(jacobian(c)) * (px * py);
+  const Floats inverse = stretch / greatest(determinant, all(1e-6f)), chord = inverse * float(LATTICE);
+  const Floats twist = root(c.dx * c.dx + c.dy * c.dy) * (px * py) * chord * 0.25f;
+  const Floats off = 0.25f * (jump_x * greatest(chord * (0.5f * px), all(1.0f)) + jump_y * greatest(chord * (0.5f * py), all(1.0f)) + twist);
+  return pick(determinant > 0.0f, inverse * chord * off, all(3e38f));
 }
 
 /// Mark the lattice cells in which interpolation is not good enough.
-inline LatticeCheck mark_cells(const Positions& lattice, Marks& marks) {
+inline LatticeCheck mark_cells(const Mesh& m, const Positions& lattice, const Raster& pixels, Marks& marks) {
   LatticeCheck check;
-  Floats worst = all(0.0f);
+  // where tissue ends
   for (int row = 0; row < marks.rows; ++row) {
-    const float *x = lattice.x + row * lattice.stride, *y = lattice.y + row * lattice.stride;
+    const float *x = lattice.x + row * lattice.stride, *below = x + lattice.stride;
     uint8_t* mark = marks.at + row * marks.stride;
     for (int k = 0; k < marks.columns; k += LANES) {
-      const Ints held = counting() + k < marks.columns;
-      const Floats off_x = bend_in_cell(x + k, lattice.stride), off_y = bend_in_cell(y + k, lattice.stride);
-      const Floats square = off_x * off_x + off_y * off_y;  // not a number where a corner is nowhere
-      const Ints good = (square < LATTICE_LIMIT * LATTICE_LIMIT) & held, bad = ~good & held;
-      worst = pick(good, greatest(square, worst), worst);
-      store_bytes(mark + k, bad & 1);
-      if (!any(bad)) continue;
-      check.marked -= sum(bad);
+      const Floats corners = load(x + k) + load(x + k + 1) + load(below + k) + load(below + k + 1);
+      const Ints ends = (corners != corners) & (counting() + k < marks.columns);
+      store_bytes(mark + k, ends & 1);
+      if (!any(ends)) continue;
+      check.marked -= sum(ends);
       marks.widen(row, k, smaller(k + LANES, marks.columns) - 1);
     }
   }
-  check.difference = __builtin_sqrtf(largest<float>(worst));
+  // where the mesh bends much, or folds
+  for (int j = 0; j < m.ny - 1; ++j)
+    for (int i = 0; i < m.nx - 1; i += LANES) {
+      const CellLanes c = cells_at(m, i, j);
+      const Floats off = pick(counting() + i < m.nx - 1, lattice_error_at(m, i, j, c), all(0.0f));
+      const Ints bad = ~(off < LATTICE_LIMIT);
+      check.difference = larger(check.difference, largest<float>(pick(bad, all(0.0f), off)));
+      if (!any(bad)) continue;
+      const Boxes b = boxes_at(m, i, j, c, pixels);
+      for (int lane = 0; lane < LANES; ++lane) {
+        if (!bad[lane] || b.first[lane] > b.last[lane]) continue;
+        const int first = larger(b.first[lane] - 1, 0) / LATTICE, last = smaller((b.last[lane] + 1) / LATTICE, marks.columns - 1);
+        const int top = larger(b.first_row[lane] - 1, 0) / LATTICE, bottom = smaller((b.last_row[lane] + 1) / LATTICE, marks.rows - 1);
+        for (int row = top; row <= bottom; ++row)
+          for (int k = first; k <= last; ++k) {
+            uint8_t& mark = marks.at[row * marks.stride + k];
+            check.marked += !mark;
+            mark = 1;
+          }
+        if (top <= bottom && first <= last) marks.widen(top, first, last), marks.widen(bottom, first, last);
+      }
+    }
   return check;
 }
 
@@ -374,30 +408,6 @@ inline float residual_of(const Mesh& m, const Positions& lattice, const Marks& m
       worst = pick(good, greatest(miss, worst), worst);
     }
   return __builtin_sqrtf(largest<float>(worst));
-}
-
-/// Mark the lattice cells that folded cells of the mesh may cover.
-inline int64_t mark_folds(const Mesh& m, const Raster& raster, Marks& marks) {
-  int64_t added = 0;
-  for (int j = 0; j < m.ny - 1; ++j)
-    for (int i = 0; i < m.nx - 1; i += LANES) {
-      const Boxes b = boxes_at(m, i, j, cells_at(m, i, j), raster);
-      if (!any(b.folded & (b.first <= b.last))) continue;
-      for (int lane = 0; lane < LANES; ++lane) {
-        if (!b.folded[lane] || b.first[lane] > b.last[lane]) continue;
-        const int first = larger(b.first[lane] - 1, 0) / LATTICE, last = smaller((b.last[lane] + 1) / LATTICE, marks.columns - 1);
-        const int top = larger(b.first_row[lane] - 1, 0) / LATTICE,
-                  bottom = smaller((b.last_row[lane] + 1) / LATTICE, marks.rows - 1);
-        for (int row = top; row <= bottom; ++row)
-          for (int k = first; k <= last; ++k) {
-            uint8_t& mark = marks.at[row * marks.stride + k];
-            added += !mark;
-            mark = 1;
-            marks.widen(row, k, k);
-          }
-      }
-    }
-  return added;
 }
 
 /// Largest misfit of the forward map at every eighth row and column, px; pixels in the rim are left out.

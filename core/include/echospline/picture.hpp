@@ -40,7 +40,7 @@ class Picture {
     m.slack = 5e-7f * float(larger(columns_, rows_) + 32);
     exact_ = o_.method == ECHOSPLINE_METHOD_EXACT || (o_.method == ECHOSPLINE_METHOD_AUTO && (m.hx < LATTICE || m.hy < LATTICE));
 
-    const bool there = ux_.reserve((m.ny + 1) * m.stride) && uy_.reserve((m.ny + 1) * m.stride) && x_.reserve(rows_ * room_) &&
+    const bool there = ux_.reserve((m.ny + 3) * m.stride) && uy_.reserve((m.ny + 3) * m.stride) && x_.reserve(rows_ * room_) &&
                        y_.reserve(rows_ * room_) && lattice_x_.reserve((cell_rows_ + 4) * lattice_room_) &&
                        lattice_y_.reserve((cell_rows_ + 4) * lattice_room_) && marks_.reserve(cell_rows_ * lattice_room_ + 8) &&
                        row_.reserve(2 * (room_ + LATTICE * LANES)) && values_.reserve(3 * room_ + 4 * LANES) &&
@@ -54,7 +54,7 @@ class Picture {
     shade_columns_ = (columns_ - 1) / shade_step_ + 2, shade_rows_ = (rows_ - 1) / shade_step_ + 2;
     shade_room_ = rounded_up(shade_columns_, LANES) + LANES;
     if (!shade_.reserve(shade_rows_ * shade_room_) || !shaded_.reserve(shade_rows_)) return false;
-    m.ux = ux_.data(), m.uy = uy_.data();
+    m.ux = ux_.data() + m.stride, m.uy = uy_.data() + m.stride;
     noise_.make(0);
     set_reference(pixels);
     return true;
@@ -82,7 +82,7 @@ class Picture {
     const Real per_x = Real(1 / o_.spacing[0]), per_y = Real(1 / o_.spacing[1]);
     for (int j = 0; j < mesh_.ny; ++j) {
       const int64_t first = int64_t(j) * mesh_.nx;
-      float *to_u = ux_.data() + j * mesh_.stride, *to_v = uy_.data() + j * mesh_.stride;
+      float *to_u = ux_.data() + (j + 1) * mesh_.stride, *to_v = uy_.data() + (j + 1) * mesh_.stride;
       for (int i = 0; i < mesh_.nx; ++i) {
         to_u[i] = static_cast<float>(u[(first + i) * step] * per_x);
         to_v[i] = static_cast<float>(v[(first + i) * step] * per_y);
@@ -170,9 +170,8 @@ class Picture {
     trace(mesh_, raster_, nullptr, points);
     extend(points.x, points.stride), extend(points.y, points.stride);
     Marks bad = marks();
-    check_ = mark_cells(points, bad);
     const Raster every_pixel = Raster::of(1, columns_, rows_);
-    if (find_folds(mesh_).cells) check_.marked += mark_folds(mesh_, every_pixel, bad);
+    check_ = mark_cells(mesh_, points, every_pixel, bad);
     if (check_.marked && !traced_) {
       for (int row = 0; row < rows_; ++row)
         each_marked_run(row, [&](int first, int count) {
@@ -185,10 +184,11 @@ class Picture {
   /// The last points were traced at the last pixels, which may be less than a step away: move them on to a whole step.
   void extend(float* p, int64_t stride) const {
     const int across = raster_.last_column - (cell_columns_ - 1) * LATTICE, down = raster_.last_row - (cell_rows_ - 1) * LATTICE;
-    for (int row = 0; row < raster_.rows && across < LATTICE; ++row) {
+    for (int row = 0; row < raster_.rows; ++row) {
       float* last = p + row * stride + cell_columns_;
       if (across == 0) last[0] = last[-1];
-      else last[0] = last[-1] + (last[0] - last[-1]) * (float(LATTICE) / across);
+      else if (across < LATTICE) last[0] = last[-1] + (last[0] - last[-1]) * (float(LATTICE) / across);
+      last[1] = last[0];  // a last pixel that is a lattice point has no next one
     }
     float *last = p + cell_rows_ * stride, *before = last - stride;
     for (int k = 0; k <= cell_columns_ && down < LATTICE; ++k) {
