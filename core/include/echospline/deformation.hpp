@@ -185,12 +185,34 @@ ECHOSPLINE_INLINE void trace_row(const Mesh& m, const Cell& c, const Limits& lim
   }
 }
 
+/// Trace points first..last, at most half as many as lanes, of all rows of a cell that does not fold: two rows at a time.
+ECHOSPLINE_INLINE void trace_row_pairs(const Mesh& m, const Cell& c, const Limits& limits, const Raster& raster, int first_row, int last_row,
+                                       int first, const Positions& out) {
+  constexpr int HALF = LANES / 2;
+  const Ints second = counting() >= HALF;
+  Floats column = to_floats(first + (counting() & (HALF - 1))) * float(raster.step);
+  if (raster.step > 1) column = least(column, all(float(raster.last_column)));
+  const Floats qx = column - c.ax;
+  for (int row = first_row; row <= last_row; row += 2) {
+    const int next = smaller(row + 1, last_row);  // the last row may come twice
+    const float above = float(smaller(row * raster.step, raster.last_row)), below = float(smaller(next * raster.step, raster.last_row));
+    Floats s, t;
+    invert<1>(c.bx, c.by, c.cx, c.cy, c.dx, c.dy, qx, pick(second, all(below), all(above)) - c.ay, s, t);
+    const Ints in = (s >= limits.s0) & (s <= limits.s1) & (t >= limits.t0) & (t <= limits.t1);
+    const int64_t at = row * out.stride + first, at_next = next * out.stride + first;
+    store_halves(out.x + at, out.x + at_next, pick(in, c.px + s * m.hx, load_halves(out.x + at, out.x + at_next)));
+    store_halves(out.y + at, out.y + at_next, pick(in, c.py + t * m.hy, load_halves(out.y + at, out.y + at_next)));
+  }
+}
+
 template <bool FOLDED>
 inline void trace_cell(const Mesh& m, int i, int j, const Raster& raster, const Boxes& b, int lane, const Marks* marks, const Positions& out) {
   const Cell c = cell_at(m, i, j);
   const Limits limits = limits_of(m, i, j);
   const int first = b.first[lane], last = b.last[lane], first_row = b.first_row[lane], last_row = b.last_row[lane];
   if (!marks) {
+    if constexpr (!FOLDED && LANES >= 8)
+      if (last - first < LANES / 2) return trace_row_pairs(m, c, limits, raster, first_row, last_row, first, out);
     for (int row = first_row; row <= last_row; ++row) trace_row<FOLDED>(m, c, limits, raster, row, first, last, out);
     return;
   }

@@ -97,6 +97,18 @@ ECHOSPLINE_INLINE void store_bytes(uint8_t* p, Ints v) {
 #endif
 }
 
+/// Half a vector from each of two places.
+ECHOSPLINE_INLINE Floats load_halves(const float* p, const float* q) {
+  Floats v;
+  std::memcpy(&v, p, sizeof v / 2);
+  std::memcpy(reinterpret_cast<char*>(&v) + sizeof v / 2, q, sizeof v / 2);
+  return v;
+}
+ECHOSPLINE_INLINE void store_halves(float* p, float* q, Floats v) {
+  std::memcpy(p, &v, sizeof v / 2);
+  std::memcpy(q, reinterpret_cast<const char*>(&v) + sizeof v / 2, sizeof v / 2);
+}
+
 ECHOSPLINE_INLINE Ints all_ints(int32_t n) { return Ints{} + n; }
 ECHOSPLINE_INLINE int32_t sum(Ints v) {
   int32_t s = 0;
