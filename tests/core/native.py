@@ -53,10 +53,28 @@ PictureOptions: Any = struct(
     border_value=c.c_double,
     white=c.c_double,
 )
-NUMBERS = (
-    "diameter lateral axial elevation elevation_depth element_height f_number dynamic_range specular lobe "
-    "lobe_elevation steering roughness rolloff wobble patches bevel ring_down ring_down_loss opacity"
-).split()
+NUMBERS = [
+    "diameter",
+    "lateral",
+    "axial",
+    "elevation",
+    "elevation_depth",
+    "element_height",
+    "f_number",
+    "dynamic_range",
+    "specular",
+    "lobe",
+    "lobe_elevation",
+    "steering",
+    "roughness",
+    "rolloff",
+    "wobble",
+    "patches",
+    "bevel",
+    "ring_down",
+    "ring_down_loss",
+    "opacity",
+]
 Needle: Any = struct(
     "Needle",
     struct_size=c.c_uint32,
@@ -143,8 +161,16 @@ def options(columns: int, rows: int, mesh_shape: tuple[int, int], **values: Any)
     o = PictureOptions(struct_size=c.sizeof(PictureOptions))
     library().echospline_picture_defaults(c.byref(o))
     spacing = values.get("spacing", (0.2, 0.2))
-    cover = [max(n - 1, 1) * d / (m - 1) for n, m, d in zip((columns, rows), mesh_shape, spacing, strict=True)]
-    first = {"columns": columns, "rows": rows, "mesh_shape": mesh_shape, "spacing": spacing, "mesh_spacing": cover}
+    cover = [
+        max(n - 1, 1) * d / (m - 1) for n, m, d in zip((columns, rows), mesh_shape, spacing, strict=True)
+    ]
+    first = {
+        "columns": columns,
+        "rows": rows,
+        "mesh_shape": mesh_shape,
+        "spacing": spacing,
+        "mesh_spacing": cover,
+    }
     return fill(o, {**first, **values})
 
 
@@ -159,7 +185,9 @@ class Picture:
         self.handle = c.c_void_p()
         self.transparent = self.options.border == 1
         self.expect(
-            library().echospline_picture_create(c.byref(self.options), self.pixels.ctypes.data, c.byref(self.handle))
+            library().echospline_picture_create(
+                c.byref(self.options), self.pixels.ctypes.data, c.byref(self.handle)
+            )
         )
 
     def __del__(self) -> None:

@@ -6,8 +6,8 @@ import ctypes as c
 from typing import Any
 
 import cv2
-import numpy as np
 import native
+import numpy as np
 import pytest
 from native import AUTO, BEVEL, EXACT, PULL, SHADOW, SHAFT, TAIL, Picture, library, needle
 from scipy.interpolate import RegularGridInterpolator
@@ -32,7 +32,9 @@ def speckle(dtype: Any = np.uint8, colour: bool = False, top: int = 200) -> np.n
     return (values if np.dtype(dtype).kind == "f" else np.rint(values)).astype(dtype)
 
 
-def bump(picture: Picture, amplitude: float, width: float = 4.0, at: tuple[float, float] = (20.0, 16.0)) -> np.ndarray:
+def bump(
+    picture: Picture, amplitude: float, width: float = 4.0, at: tuple[float, float] = (20.0, 16.0)
+) -> np.ndarray:
     """A push; its steepest gradient is 0.86 amplitude / width."""
     r2 = ((picture.nodes - at) ** 2).sum(axis=1)
     return amplitude * np.exp(-r2 / width**2)[:, None] * [1.0, 0.4]
@@ -49,7 +51,9 @@ def forward(picture: Picture, u: np.ndarray, x: np.ndarray, y: np.ndarray) -> tu
     return x + field[..., 0] / o.spacing[0], y + field[..., 1] / o.spacing[1]
 
 
-def positions(u: np.ndarray, mesh: tuple[int, int], method: int, **values: Any) -> tuple[np.ndarray, np.ndarray]:
+def positions(
+    u: np.ndarray, mesh: tuple[int, int], method: int, **values: Any
+) -> tuple[np.ndarray, np.ndarray]:
     """Where a method's pixels come from, read from drawn ramps."""
     return tuple(
         Picture(ramp, mesh, method=method, border_value=-1e6, **values).deform(u).draw() for ramp in ramps()
@@ -267,11 +271,13 @@ def test_values_are_scipys_at_the_inverse_map(level, dtype, colour):
     image = speckle(dtype, colour) - (100 if dtype == np.int16 else 0)
     image = image.astype(dtype)
     picture = Picture(image, (21, 17), level=level, method=EXACT, border_value=3)
-    out = picture.deform(bump(picture, 2.0) + [0.7, 0.3]).draw()
+    out = picture.deform(bump(picture, 2.0) + np.array([0.7, 0.3])).draw()
     x, y = picture.inverse()
     planes = image.reshape(ROWS, COLUMNS, -1).astype(float)
     at = np.nan_to_num([y.astype(float), x.astype(float)])
-    theirs = np.stack([map_coordinates(p, at, order=1, mode="nearest") for p in np.moveaxis(planes, 2, 0)], axis=-1)
+    theirs = np.stack(
+        [map_coordinates(p, at, order=1, mode="nearest") for p in np.moveaxis(planes, 2, 0)], axis=-1
+    )
     theirs[np.isnan(x)] = 3
     assert np.isnan(x).any()
     tolerance = 0.01 if dtype == np.float32 else 0.51
@@ -296,7 +302,9 @@ def test_nearest_takes_the_pixel_at_the_rounded_position(dtype, method):
     u = bump(picture, 1.5)
     out = Picture(image, (21, 17), interpolation=1, method=method).deform(u).draw()
     x, y = picture.deform(u).inverse()
-    theirs = image[np.clip(np.rint(y), 0, ROWS - 1).astype(int), np.clip(np.rint(x), 0, COLUMNS - 1).astype(int)]
+    theirs = image[
+        np.clip(np.rint(y), 0, ROWS - 1).astype(int), np.clip(np.rint(x), 0, COLUMNS - 1).astype(int)
+    ]
     if method == EXACT:
         np.testing.assert_array_equal(out, theirs)
     else:
@@ -304,7 +312,9 @@ def test_nearest_takes_the_pixel_at_the_rounded_position(dtype, method):
     assert set(np.unique(out)) <= set(np.unique(image))
 
 
-@pytest.mark.parametrize("dtype,full", [(np.uint8, 255), (np.uint16, 65535), (np.int16, 32767), (np.float32, 1)])
+@pytest.mark.parametrize(
+    ("dtype", "full"), [(np.uint8, 255), (np.uint16, 65535), (np.int16, 32767), (np.float32, 1)]
+)
 @pytest.mark.parametrize("colour", [False, True])
 def test_transparent_outside(dtype, full, colour):
     image = speckle(dtype, colour)
@@ -362,7 +372,9 @@ def direction(tilt: float) -> np.ndarray:
     return np.array([np.cos(np.radians(tilt)), np.sin(np.radians(tilt)), 0.0])
 
 
-def tilted(tilt: float, length: float = 30.0, middle: tuple[float, float] = (22.0, 18.0), **values: Any) -> Any:
+def tilted(
+    tilt: float, length: float = 30.0, middle: tuple[float, float] = (22.0, 18.0), **values: Any
+) -> Any:
     """Needle in the plane around a middle."""
     m = np.array([*middle, 0.0])
     u = direction(tilt)
@@ -387,8 +399,17 @@ def contrast(tilt: float, seed: int, tissue: int = 90) -> float:
 
 
 @pytest.mark.parametrize(
-    "tilt,low,high",
-    [(10, 0.9, 1.1), (15, 0.85, 1.05), (20, 0.6, 0.9), (35, 0.15, 0.35), (50, 0.15, 0.35), (60, 0.1, 0.3), (75, 0.05, 0.2), (88, 0.02, 0.16)],
+    ("tilt", "low", "high"),
+    [
+        (10, 0.9, 1.1),
+        (15, 0.85, 1.05),
+        (20, 0.6, 0.9),
+        (35, 0.15, 0.35),
+        (50, 0.15, 0.35),
+        (60, 0.1, 0.3),
+        (75, 0.05, 0.2),
+        (88, 0.02, 0.16),
+    ],
 )
 def test_contrast_against_tilt_is_the_one_measured(tilt, low, high):
     # gel: 0.27 to 0.32 of the peak at 35 to 60 degrees, 0.11 to 0.13 at 60 to 90 (van de Berg et al. 2018); the fall between 10 and 20
@@ -532,9 +553,10 @@ def test_the_shadow_lies_behind_the_shaft_and_nowhere_else():
     # edges are soft: some millimetres of penumbra 15 mm below the tip
     row = shaded[int((y1 + 12) / FINE)]
     dark_level = row.min()
-    edge = np.flatnonzero(row[int(x1 / FINE) - 60 :] > 120 - 0.1 * (120 - dark_level))[0] - np.flatnonzero(
-        row[int(x1 / FINE) - 60 :] > dark_level + 0.1 * (120 - dark_level)
-    )[0]
+    edge = (
+        np.flatnonzero(row[int(x1 / FINE) - 60 :] > 120 - 0.1 * (120 - dark_level))[0]
+        - np.flatnonzero(row[int(x1 / FINE) - 60 :] > dark_level + 0.1 * (120 - dark_level))[0]
+    )
     assert 2.5 < edge * FINE < 9
 
 
@@ -563,7 +585,9 @@ def test_the_drawn_shadow_is_the_one_at_the_points():
     _, passed = picture.echo(n, np.stack([x, y], axis=-1))
     expected = 200 + 255 / 60 * 10 * np.log10(passed.reshape(x.shape))
     off = np.abs(picture.draw(n) - np.clip(expected, 0, 255))
-    assert off.max() < 6  # at the very end of the shaft; the shadow is interpolated between every fourth pixel
+    assert (
+        off.max() < 6
+    )  # at the very end of the shaft; the shadow is interpolated between every fourth pixel
     assert np.quantile(off, 0.999) < 2
     assert passed.min() < 0.3
 
@@ -594,7 +618,7 @@ def test_the_tail_is_there_only_near_perpendicular():
     assert below(30) == 0
 
 
-@pytest.mark.parametrize("dtype,white", [(np.uint16, 4095), (np.int16, 1000), (np.float32, 1.0)])
+@pytest.mark.parametrize(("dtype", "white"), [(np.uint16, 4095), (np.int16, 1000), (np.float32, 1.0)])
 def test_other_types_get_the_same_needle(dtype, white):
     grey = dark(100).draw(tilted(25)).astype(float)
     image = np.full((440, 500), 100 / 255 * white).astype(dtype)
@@ -621,7 +645,9 @@ def test_turning_needle_and_beam_together_turns_the_echo():
 
     def turned(points: Any, angle: float) -> np.ndarray:
         a = np.radians(angle)
-        return apex + (np.asarray(points) - apex) @ np.array([[np.cos(a), np.sin(a)], [-np.sin(a), np.cos(a)]])
+        return apex + (np.asarray(points) - apex) @ np.array(
+            [[np.cos(a), np.sin(a)], [-np.sin(a), np.cos(a)]]
+        )
 
     entry, tip = np.array([16.0, 10.0]), np.array([30.0, 18.0])
     points = np.stack(np.meshgrid(np.arange(12, 34, 0.2), np.arange(6, 26, 0.2)), axis=-1).reshape(-1, 2)
@@ -641,7 +667,7 @@ def test_turning_needle_and_beam_together_turns_the_echo():
 
 
 @pytest.mark.parametrize(
-    "entry,tip",
+    ("entry", "tip"),
     [
         ((-300, -300, 0), (400, 400, 0)),
         ((1e6, 1e6, 1e6), (-1e6, -1e6, -1e6)),
@@ -682,7 +708,7 @@ PIXELS = np.zeros((8, 8), np.uint8)
 
 
 @pytest.mark.parametrize(
-    "name,value,status",
+    ("name", "value", "status"),
     [
         ("struct_size", 0, 2),
         ("struct_size", 12, 2),
@@ -729,7 +755,14 @@ def test_null_is_refused():
     library().echospline_picture_destroy(None)
     library().echospline_picture_defaults(None)
     library().echospline_needle_defaults(None)
-    for name, count in (("reference", 2), ("deform", 2), ("draw", 3), ("inverse", 3), ("check", 1), ("echo", 5)):
+    for name, count in (
+        ("reference", 2),
+        ("deform", 2),
+        ("draw", 3),
+        ("inverse", 3),
+        ("check", 1),
+        ("echo", 5),
+    ):
         arguments = [0 if k == count - 1 and name not in ("check", "echo") else None for k in range(count)]
         if name == "echo":
             arguments[2] = 0
@@ -743,7 +776,13 @@ def test_wrong_arrays_are_refused_and_change_nothing():
     picture = Picture(image, (5, 4))
     lib, handle = library(), picture.handle
     u = np.zeros((20, 2))
-    for bad in (np.zeros((19, 2)), np.zeros((0, 2)), np.full((20, 2), np.nan), np.full((20, 2), 1e7), np.full((20, 2), -np.inf)):
+    for bad in (
+        np.zeros((19, 2)),
+        np.zeros((0, 2)),
+        np.full((20, 2), np.nan),
+        np.full((20, 2), 1e7),
+        np.full((20, 2), -np.inf),
+    ):
         with pytest.raises(ValueError, match="displacement must"):
             picture.deform(bad)
         with pytest.raises(ValueError, match="displacement must"):
@@ -787,7 +826,7 @@ NEEDLE_FAULTS = [
 ]
 
 
-@pytest.mark.parametrize("name,value", NEEDLE_FAULTS)
+@pytest.mark.parametrize(("name", "value"), NEEDLE_FAULTS)
 def test_wrong_needles_are_refused_by_name(name, value):
     picture = Picture(speckle(), (5, 4))
     n = needle((0, 0, 0), (10, 10, 0))
