@@ -12,11 +12,13 @@ struct PictureEntries {
   void (*reference)(void* picture, const void* pixels);
   void (*deform)(void* picture, const double* displacement);
   void (*deform_single)(void* picture, const float* displacement);
-  void (*deform_planes)(void* picture, const float* x, const float* y);  // mm, a plane per direction: as a tissue of this level keeps them
+  void (*deform_planes)(void* picture, const float* x,
+                        const float* y);  // mm, a plane per direction: as a tissue of this level keeps them
   void (*draw)(void* picture, const echospline_needle* needle, void* out);
   void (*inverse)(void* picture, float* x, float* y);
   void (*check)(void* picture, echospline_picture_report& report);
-  void (*echo)(void* picture, const echospline_needle& needle, const double* points, int64_t count, double* power, double* transmission);
+  void (*echo)(void* picture, const echospline_needle& needle, const double* points, int64_t count, double* power,
+               double* transmission);
 };
 
 }  // namespace echospline

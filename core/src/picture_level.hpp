@@ -35,9 +35,8 @@ const PictureEntries picture_entries = {
     [](void* picture, const echospline_needle* needle, void* out) { picture_of(picture).draw(needle, out); },
     [](void* picture, float* x, float* y) { picture_of(picture).inverse(x, y); },
     [](void* picture, echospline_picture_report& report) { picture_of(picture).check(report); },
-    [](void* picture, const echospline_needle& needle, const double* points, int64_t count, double* power, double* transmission) {
-      picture_of(picture).echo_at(needle, points, count, power, transmission);
-    },
+    [](void* picture, const echospline_needle& needle, const double* points, int64_t count, double* power,
+       double* transmission) { picture_of(picture).echo_at(needle, points, count, power, transmission); },
 };
 
 }  // namespace

@@ -1,28 +1,31 @@
-// The deformation of the picture: the map x -> x + u(x), bilinear in the cells of a mesh, and its inverse. Lengths are pixels.
+// The deformation of the picture: the map x -> x + u(x), bilinear in the cells of a mesh, and its inverse. Lengths are
+// pixels.
 //
-// Inside a cell the map is x = a + s b + t c + s t d, so t is the root of a quadratic equation and s follows: the inverse is a formula,
-// and needs no starting guess however steep the field is. Two ways lead to the picture:
+// Inside a cell the map is x = a + s b + t c + s t d, so t is the root of a quadratic equation and s follows: the
+// inverse is a formula, and needs no starting guess however steep the field is. Two ways lead to the picture:
 // - exact: every pixel is traced back in every cell that covers it;
-// - pull: only each fourth pixel of each fourth row is (the lattice), and between them the reference position is interpolated.
-//   Where that would differ by more than a tenth of a pixel, or tissue ends or folds, lattice cells are traced pixel by pixel.
+// - pull: only each fourth pixel of each fourth row is (the lattice); between them the position is interpolated.
+//   Where that would differ by more than a tenth of a pixel, or tissue ends or folds, lattice cells are traced pixel by
+// pixel.
 #pragma once
 #include "array.hpp"
 #include "gathering.hpp"
 
 namespace echospline::ECHOSPLINE_CORE {
 
-constexpr int LATTICE = 4;              // pixels between lattice points: at 8 the interpolation misses 0.05 px near a tip, at 4 0.012 px
-constexpr float LATTICE_LIMIT = 0.1f;   // px by which an interpolated position may miss the exact one: a tenth of a pixel is not seen
-constexpr float RIM = 0.5f;             // px: a pixel has an area, so tissue reaches half a pixel beyond the mesh's outermost nodes
-constexpr int CHECK_EVERY = 8;          // rows and columns between pixels at which the exact inverse is composed with the forward map
+constexpr int LATTICE = 4;  // pixels between lattice points: at 8 they miss 0.05 px near a tip, at 4 0.012 px
+constexpr float LATTICE_LIMIT = 0.1f;  // px that an interpolated position may miss: a tenth of a pixel is not seen
+constexpr float RIM = 0.5f;            // px: a pixel has an area, so tissue reaches half of one beyond the mesh
+constexpr int CHECK_EVERY = 8;         // rows and columns between pixels at which the inverse is checked
 
-/// Nodes and displacement, in pixels; rows of `stride` numbers, readable LANES beyond their ends and a row before and after them.
+/// Nodes and displacement, in pixels; rows of `stride` numbers, readable LANES beyond their ends and a row before and
+/// after them.
 struct Mesh {
   int nx, ny;
   int64_t stride;
   float x0, y0, hx, hy;  // first node and spacing
   const float *ux, *uy;
-  float slack;           // px by which cells overlap, so that rounding leaves no pixel between two cells
+  float slack;  // px by which cells overlap, so that rounding leaves no pixel between two cells
 };
 
 /// x = a + s b + t c + s t d in one cell; p: its first node in the reference.
@@ -42,10 +45,11 @@ ECHOSPLINE_INLINE Cell cell_at(const Mesh& m, int i, int j) {
   return c;
 }
 
-/// Where in the cell the point a + q lies. SIGN +1: where the map keeps the orientation, -1: where it turns tissue over.
-/// Number: a float for one cell, or lanes for many.
+/// Where in the cell the point a + q lies. SIGN +1: where the map keeps the orientation, -1: where it turns tissue
+/// over. Number: a float for one cell, or lanes for many.
 template <int SIGN, class Number>
-ECHOSPLINE_INLINE void invert(Number bx, Number by, Number cx, Number cy, Number dx, Number dy, Floats qx, Floats qy, Floats& s, Floats& t) {
+ECHOSPLINE_INLINE void invert(Number bx, Number by, Number cx, Number cy, Number dx, Number dy, Floats qx, Floats qy,
+                              Floats& s, Floats& t) {
   // (q - t c) x (b + t d) = 0, that is A t^2 + B t + C = 0
   const Number A = cx * dy - cy * dx;
   const Floats B = (cx * by - cy * bx) - (qx * dy - qy * dx), C = qy * bx - qx * by;
@@ -110,7 +114,8 @@ ECHOSPLINE_INLINE Boxes boxes_at(const Mesh& m, int i, int j, const CellLanes& c
   const Limits inner = {-m.slack / m.hx, 1 + m.slack / m.hx, -m.slack / m.hy, 1 + m.slack / m.hy};
   const Floats s0 = pick(n == 0, all(inner.s0 - RIM / m.hx), all(inner.s0));
   const Floats s1 = pick(n == m.nx - 2, all(inner.s1 + RIM / m.hx), all(inner.s1));
-  const Floats t0 = all(j == 0 ? inner.t0 - RIM / m.hy : inner.t0), t1 = all(j == m.ny - 2 ? inner.t1 + RIM / m.hy : inner.t1);
+  const Floats t0 = all(j == 0 ? inner.t0 - RIM / m.hy : inner.t0),
+               t1 = all(j == m.ny - 2 ? inner.t1 + RIM / m.hy : inner.t1);
   Floats low_x = all(3e38f), low_y = low_x, high_x = -low_x, high_y = -low_x;
   const Floats ss[2] = {s0, s1}, ts[2] = {t0, t1};
   for (const Floats& s : ss)
@@ -139,7 +144,8 @@ ECHOSPLINE_INLINE Boxes boxes_at(const Mesh& m, int i, int j, const CellLanes& c
   return b;
 }
 
-/// Reference positions of lattice points or pixels, NaN where no tissue is; rows of `stride`, writable LANES beyond their end.
+/// Reference positions of lattice points or pixels, NaN where no tissue is; rows of `stride`, writable LANES beyond
+/// their end.
 struct Positions {
   float *x, *y;
   int columns, rows;
@@ -155,14 +161,15 @@ struct Marks {
 
   void widen(int row, int begin, int end) {
     if (last_row < 0) first = begin, last = end, first_row = row;
-    first = smaller(first, begin), last = larger(last, end), first_row = smaller(first_row, row), last_row = larger(last_row, row);
+    first = smaller(first, begin), last = larger(last, end), first_row = smaller(first_row, row),
+    last_row = larger(last_row, row);
   }
 };
 
 /// Trace points first..last of one row in one cell. A turned-over place counts only where no upright one is found.
 template <bool FOLDED>
-ECHOSPLINE_INLINE void trace_row(const Mesh& m, const Cell& c, const Limits& limits, const Raster& raster, int row, int first, int last,
-                                 const Positions& out) {
+ECHOSPLINE_INLINE void trace_row(const Mesh& m, const Cell& c, const Limits& limits, const Raster& raster, int row,
+                                 int first, int last, const Positions& out) {
   const Floats qy = all(smaller(row * raster.step, raster.last_row) - c.ay);
   float *x = out.x + row * out.stride, *y = out.y + row * out.stride;
   for (int k = first; k <= last; k += LANES) {
@@ -185,9 +192,10 @@ ECHOSPLINE_INLINE void trace_row(const Mesh& m, const Cell& c, const Limits& lim
   }
 }
 
-/// Trace points first..last, at most half as many as lanes, of all rows of a cell that does not fold: two rows at a time.
-ECHOSPLINE_INLINE void trace_row_pairs(const Mesh& m, const Cell& c, const Limits& limits, const Raster& raster, int first_row, int last_row,
-                                       int first, const Positions& out) {
+/// Trace points first..last, at most half as many as lanes, of all rows of a cell that does not fold: two rows at a
+/// time.
+ECHOSPLINE_INLINE void trace_row_pairs(const Mesh& m, const Cell& c, const Limits& limits, const Raster& raster,
+                                       int first_row, int last_row, int first, const Positions& out) {
   constexpr int HALF = LANES / 2;
   const Ints second = counting() >= HALF;
   Floats column = to_floats(first + (counting() & (HALF - 1))) * float(raster.step);
@@ -195,7 +203,8 @@ ECHOSPLINE_INLINE void trace_row_pairs(const Mesh& m, const Cell& c, const Limit
   const Floats qx = column - c.ax;
   for (int row = first_row; row <= last_row; row += 2) {
     const int next = smaller(row + 1, last_row);  // the last row may come twice
-    const float above = float(smaller(row * raster.step, raster.last_row)), below = float(smaller(next * raster.step, raster.last_row));
+    const float above = float(smaller(row * raster.step, raster.last_row)),
+                below = float(smaller(next * raster.step, raster.last_row));
     Floats s, t;
     invert<1>(c.bx, c.by, c.cx, c.cy, c.dx, c.dy, qx, pick(second, all(below), all(above)) - c.ay, s, t);
     const Ints in = (s >= limits.s0) & (s <= limits.s1) & (t >= limits.t0) & (t <= limits.t1);
@@ -206,7 +215,8 @@ ECHOSPLINE_INLINE void trace_row_pairs(const Mesh& m, const Cell& c, const Limit
 }
 
 template <bool FOLDED>
-inline void trace_cell(const Mesh& m, int i, int j, const Raster& raster, const Boxes& b, int lane, const Marks* marks, const Positions& out) {
+inline void trace_cell(const Mesh& m, int i, int j, const Raster& raster, const Boxes& b, int lane, const Marks* marks,
+                       const Positions& out) {
   const Cell c = cell_at(m, i, j);
   const Limits limits = limits_of(m, i, j);
   const int first = b.first[lane], last = b.last[lane], first_row = b.first_row[lane], last_row = b.last_row[lane];
@@ -217,11 +227,14 @@ inline void trace_cell(const Mesh& m, int i, int j, const Raster& raster, const 
     return;
   }
   // runs of marked lattice cells; the last one of a row or column holds the picture's last pixels
-  const int first_cell = smaller(first / LATTICE, marks->columns - 1), last_cell = smaller(last / LATTICE, marks->columns - 1);
-  const int first_band = smaller(first_row / LATTICE, marks->rows - 1), last_band = smaller(last_row / LATTICE, marks->rows - 1);
+  const int first_cell = smaller(first / LATTICE, marks->columns - 1),
+            last_cell = smaller(last / LATTICE, marks->columns - 1);
+  const int first_band = smaller(first_row / LATTICE, marks->rows - 1),
+            last_band = smaller(last_row / LATTICE, marks->rows - 1);
   for (int band = first_band; band <= last_band; ++band) {
     const uint8_t* mark = marks->at + band * marks->stride;
-    const int top = larger(first_row, band * LATTICE), bottom = band == last_band ? last_row : band * LATTICE + LATTICE - 1;
+    const int top = larger(first_row, band * LATTICE),
+              bottom = band == last_band ? last_row : band * LATTICE + LATTICE - 1;
     for (int k = first_cell; k <= last_cell; ++k) {
       if (!mark[k]) continue;
       const int begin = larger(first, k * LATTICE);
@@ -233,10 +246,12 @@ inline void trace_cell(const Mesh& m, int i, int j, const Raster& raster, const 
 }
 
 /// Trace the points of LANES cells that do not fold, each lane in its own cell: for cells that hold few points.
-ECHOSPLINE_INLINE void trace_cells(const Mesh& m, int i, int j, const CellLanes& c, const Boxes& b, const Raster& raster, const Positions& out) {
+ECHOSPLINE_INLINE void trace_cells(const Mesh& m, int i, int j, const CellLanes& c, const Boxes& b,
+                                   const Raster& raster, const Positions& out) {
   const Ints n = counting() + i;
   const float es = m.slack / m.hx, et = m.slack / m.hy;
-  const Floats s0 = pick(n == 0, all(-es - RIM / m.hx), all(-es)), s1 = pick(n == m.nx - 2, all(1 + es + RIM / m.hx), all(1 + es));
+  const Floats s0 = pick(n == 0, all(-es - RIM / m.hx), all(-es)),
+               s1 = pick(n == m.nx - 2, all(1 + es + RIM / m.hx), all(1 + es));
   const Floats t0 = all(j == 0 ? -et - RIM / m.hy : -et), t1 = all(j == m.ny - 2 ? 1 + et + RIM / m.hy : 1 + et);
   const Floats px = m.x0 + to_floats(n) * m.hx;
   const float py = m.y0 + j * m.hy;
@@ -265,8 +280,8 @@ inline void trace(const Mesh& m, const Raster& raster, const Marks* marks, const
       Boxes b = boxes_at(m, i, j, c, raster);
       Ints alone = b.first <= b.last;  // lanes that are traced on their own
       if (marks)
-        alone &= (b.last >= marks->first * LATTICE) & (b.first < (marks->last + 1) * LATTICE + 1) & (b.last_row >= marks->first_row * LATTICE) &
-                 (b.first_row < (marks->last_row + 1) * LATTICE + 1);
+        alone &= (b.last >= marks->first * LATTICE) & (b.first < (marks->last + 1) * LATTICE + 1) &
+                 (b.last_row >= marks->first_row * LATTICE) & (b.first_row < (marks->last_row + 1) * LATTICE + 1);
       if (!any(alone)) continue;
       if (!marks && (most(b.last - b.first) + 1) * (most(b.last_row - b.first_row) + 1) <= FEW_POINTS) {
         alone &= b.folded;
@@ -305,7 +320,8 @@ inline Folds find_folds(const Mesh& m) {
       const Ints held = counting() + i < m.nx - 1;
       const Floats worst = smallest(c) * scale;
       if (!any(held & ~(worst > larger(0.0f, found.smallest)))) continue;
-      const Floats corners[4] = {c.top_left * scale, c.top_right * scale, c.bottom_left * scale, c.bottom_right * scale};
+      const Floats corners[4] = {c.top_left * scale, c.top_right * scale, c.bottom_left * scale,
+                                 c.bottom_right * scale};
       for (int lane = 0; lane < LANES && i + lane < m.nx - 1; ++lane) {
         found.cells += !(worst[lane] > 0);
         for (int k = 0; k < 4; ++k)
@@ -316,7 +332,8 @@ inline Folds find_folds(const Mesh& m) {
   return found;
 }
 
-/// Squared distance between the forward map of reference positions and the pixels p where they should come to lie, px^2.
+/// Squared distance between the forward map of reference positions and the pixels p where they should come to lie,
+/// px^2.
 ECHOSPLINE_INLINE Floats square_misfit_at(const Mesh& m, Floats x, Floats y, Floats px, Floats py) {
   const Floats fx = (x - m.x0) * (1.0f / m.hx), fy = (y - m.y0) * (1.0f / m.hy);
   const Ints i = to_ints(within(fx, 0.0f, float(m.nx - 2))), j = to_ints(within(fy, 0.0f, float(m.ny - 2)));
@@ -334,18 +351,20 @@ ECHOSPLINE_INLINE Floats square_misfit_at(const Mesh& m, Floats x, Floats y, Flo
 /// What the lattice left to be traced exactly, and how far the rest is off.
 struct LatticeCheck {
   int64_t marked = 0;
-  float difference = 0;  // px, largest distance of an interpolated position from the exact one that bends of the mesh allow
+  float difference = 0;  // px, bound of the distance between interpolated and exact positions
 };
 
 /// Squared bend of the displacement at nodes: its second difference towards `step`.
 ECHOSPLINE_INLINE Floats bend_at(const float* u, const float* v, int64_t step) {
-  const Floats x = (load(u + step) - load(u)) - (load(u) - load(u - step)), y = (load(v + step) - load(v)) - (load(v) - load(v - step));
+  const Floats x = (load(u + step) - load(u)) - (load(u) - load(u - step)),
+               y = (load(v + step) - load(v)) - (load(v) - load(v - step));
   return x * x + y * y;
 }
 /// How far positions between lattice points may be off in LANES cells, px; huge where they fold.
 ///
-/// Between lattice points lie l = LATTICE |J^-1| pixels of the reference. Where the gradient jumps by g across an edge of the mesh, the displacement leaves
-/// its chord by at most g l / 4, and by l / 2h times as much where the mesh is finer than that; the position is off by |J^-1| times that.
+/// Between lattice points lie l = LATTICE |J^-1| pixels of the reference. Where the gradient jumps by g across an edge
+/// of the mesh, the displacement leaves its chord by at most g l / 4, and by l / 2h times as much where the mesh is
+/// finer than that; the position is off by |J^-1| times that.
 ECHOSPLINE_INLINE Floats lattice_error_at(const Mesh& m, int i, int j, const CellLanes& c) {
   const float *u = m.ux + j * m.stride + i, *v = m.uy + j * m.stride + i;
   const int64_t down = m.stride;
@@ -353,19 +372,24 @@ ECHOSPLINE_INLINE Floats lattice_error_at(const Mesh& m, int i, int j, const Cel
   const Floats none = all(0.0f);
   // the mesh's own edges do not bend
   const Floats left = pick(n > 0, greatest(bend_at(u, v, 1), bend_at(u + down, v + down, 1)), none);
-  const Floats right = pick(n < m.nx - 2, greatest(bend_at(u + 1, v + 1, 1), bend_at(u + down + 1, v + down + 1, 1)), none);
+  const Floats right =
+      pick(n < m.nx - 2, greatest(bend_at(u + 1, v + 1, 1), bend_at(u + down + 1, v + down + 1, 1)), none);
   const Floats top = j > 0 ? greatest(bend_at(u, v, down), bend_at(u + 1, v + 1, down)) : none;
-  const Floats bottom = j < m.ny - 2 ? greatest(bend_at(u + down, v + down, down), bend_at(u + down + 1, v + down + 1, down)) : none;
+  const Floats bottom =
+      j < m.ny - 2 ? greatest(bend_at(u + down, v + down, down), bend_at(u + down + 1, v + down + 1, down)) : none;
   const float px = 1.0f / m.hx, py = 1.0f / m.hy;
   const Floats jump_x = root(greatest(left, right)) * px, jump_y = root(greatest(top, bottom)) * py;
   // |J^-1|: largest singular value of J over its determinant, at the cell's worst
-  const Floats xx = (c.bx + 0.5f * c.dx) * px, yx = (c.by + 0.5f * c.dy) * px, xy = (c.cx + 0.5f * c.dx) * py, yy = (c.cy + 0.5f * c.dy) * py;
+  const Floats xx = (c.bx + 0.5f * c.dx) * px, yx = (c.by + 0.5f * c.dy) * px, xy = (c.cx + 0.5f * c.dx) * py,
+               yy = (c.cy + 0.5f * c.dy) * py;
   const Floats sum_a = xx + yy, sum_b = yx - xy, difference_a = xx - yy, difference_b = yx + xy;
-  const Floats stretch = 0.5f * (root(sum_a * sum_a + sum_b * sum_b) + root(difference_a * difference_a + difference_b * difference_b));
+  const Floats stretch =
+      0.5f * (root(sum_a * sum_a + sum_b * sum_b) + root(difference_a * difference_a + difference_b * difference_b));
   const Floats determinant = smallest(jacobian(c)) * (px * py);
   const Floats inverse = stretch / greatest(determinant, all(1e-6f)), chord = inverse * float(LATTICE);
   const Floats twist = root(c.dx * c.dx + c.dy * c.dy) * (px * py) * chord * 0.25f;
-  const Floats off = 0.25f * (jump_x * greatest(chord * (0.5f * px), all(1.0f)) + jump_y * greatest(chord * (0.5f * py), all(1.0f)) + twist);
+  const Floats off = 0.25f * (jump_x * greatest(chord * (0.5f * px), all(1.0f)) +
+                              jump_y * greatest(chord * (0.5f * py), all(1.0f)) + twist);
   return pick(determinant > 0.0f, inverse * chord * off, all(3e38f));
 }
 
@@ -396,8 +420,10 @@ inline LatticeCheck mark_cells(const Mesh& m, const Positions& lattice, const Ra
       const Boxes b = boxes_at(m, i, j, c, pixels);
       for (int lane = 0; lane < LANES; ++lane) {
         if (!bad[lane] || b.first[lane] > b.last[lane]) continue;
-        const int first = larger(b.first[lane] - 1, 0) / LATTICE, last = smaller((b.last[lane] + 1) / LATTICE, marks.columns - 1);
-        const int top = larger(b.first_row[lane] - 1, 0) / LATTICE, bottom = smaller((b.last_row[lane] + 1) / LATTICE, marks.rows - 1);
+        const int first = larger(b.first[lane] - 1, 0) / LATTICE,
+                  last = smaller((b.last[lane] + 1) / LATTICE, marks.columns - 1);
+        const int top = larger(b.first_row[lane] - 1, 0) / LATTICE,
+                  bottom = smaller((b.last_row[lane] + 1) / LATTICE, marks.rows - 1);
         for (int row = top; row <= bottom; ++row)
           for (int k = first; k <= last; ++k) {
             uint8_t& mark = marks.at[row * marks.stride + k];
@@ -418,15 +444,19 @@ inline float residual_of(const Mesh& m, const Positions& lattice, const Marks& m
       const float *x = lattice.x + row * lattice.stride + k, *y = lattice.y + row * lattice.stride + k;
       const uint8_t* mark = marks.at + row * marks.stride + k;
       // the last column and row of points lie at the last pixel
-      const Floats left = (counted() + float(k)) * float(LATTICE), right = least(left + float(LATTICE), all(float(raster.last_column)));
+      const Floats left = (counted() + float(k)) * float(LATTICE),
+                   right = least(left + float(LATTICE), all(float(raster.last_column)));
       const float top = float(row * LATTICE), bottom = smaller(top + LATTICE, float(raster.last_row));
       const float f = row == marks.rows - 1 ? (bottom - top) / (2 * LATTICE) : 0.5f;  // stored as if a whole step below
       const Floats g = (right - left) * (0.5f / LATTICE);
-      const Floats ax = load(x) + f * (load(x + lattice.stride) - load(x)), bx = load(x + 1) + f * (load(x + lattice.stride + 1) - load(x + 1));
-      const Floats ay = load(y) + f * (load(y + lattice.stride) - load(y)), by = load(y + 1) + f * (load(y + lattice.stride + 1) - load(y + 1));
+      const Floats ax = load(x) + f * (load(x + lattice.stride) - load(x)),
+                   bx = load(x + 1) + f * (load(x + lattice.stride + 1) - load(x + 1));
+      const Floats ay = load(y) + f * (load(y + lattice.stride) - load(y)),
+                   by = load(y + 1) + f * (load(y + lattice.stride + 1) - load(y + 1));
       Ints good = counting() + k < marks.columns;
       for (int lane = 0; lane < LANES; ++lane) good[lane] &= mark[lane] ? 0 : -1;
-      const Floats miss = square_misfit_at(m, ax + g * (bx - ax), ay + g * (by - ay), 0.5f * (left + right), all(0.5f * (top + bottom)));
+      const Floats miss = square_misfit_at(m, ax + g * (bx - ax), ay + g * (by - ay), 0.5f * (left + right),
+                                           all(0.5f * (top + bottom)));
       worst = pick(good, greatest(miss, worst), worst);
     }
   return __builtin_sqrtf(largest<float>(worst));

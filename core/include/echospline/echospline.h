@@ -228,8 +228,8 @@ ECHOSPLINE_API echospline_status echospline_state_load(echospline_tissue* tissue
 
 /* ---- Picture ------------------------------------------------------------------------------------------------------ */
 
-/* A picture shows the reference image deformed, with a needle in it. A pixel has an area: tissue reaches half a pixel beyond the mesh's
- * outermost nodes, and beyond the reference's outermost centres its outermost pixels count. */
+/* A picture shows the reference image deformed, with a needle in it. A pixel has an area: tissue reaches half a pixel
+ * beyond the mesh's outermost nodes, and beyond the reference's outermost centres its outermost pixels count. */
 
 enum { ECHOSPLINE_UINT8 = 0, ECHOSPLINE_UINT16 = 1, ECHOSPLINE_INT16 = 2, ECHOSPLINE_FLOAT32 = 3 };  /* pixel_type */
 enum { ECHOSPLINE_LINEAR = 0, ECHOSPLINE_NEAREST = 1 };                                              /* interpolation */
@@ -240,7 +240,7 @@ enum {
 enum {
   ECHOSPLINE_METHOD_AUTO = 0,        /* pull, or exact where the mesh is finer than the lattice */
   ECHOSPLINE_METHOD_EXACT = 1,       /* every pixel traced back in the cells of the mesh */
-  ECHOSPLINE_METHOD_PULL = 2         /* every fourth pixel of every fourth row, interpolated where that is good to 0.1 pixel */
+  ECHOSPLINE_METHOD_PULL = 2         /* every fourth pixel and row, interpolated where that is good to 0.1 pixel */
 };
 
 typedef struct echospline_picture_options {
@@ -259,7 +259,7 @@ typedef struct echospline_picture_options {
   double mesh_spacing[2];    /* mm */
   double mesh_origin[2];     /* first node, mm */
   double border_value;
-  double white;              /* grey level at which the display is white; 0: 255, the largest of an integer type, or 1 */
+  double white;              /* grey level at which the display is white; 0: the largest of an integer type, or 1 */
 } echospline_picture_options;
 
 enum {                       /* parts of a needle's echo, bits */
@@ -301,8 +301,8 @@ typedef struct echospline_needle {
 typedef struct echospline_picture_report {
   uint32_t struct_size;
   int32_t method;            /* used: ECHOSPLINE_METHOD_EXACT or ECHOSPLINE_METHOD_PULL */
-  double residual;           /* largest distance between a checked pixel and the forward map of where it comes from, pixels */
-  double difference;         /* pull: estimated largest distance of a reference position from the exact one, pixels */
+  double residual;           /* largest distance of a checked pixel from the forward map of its origin, pixels */
+  double difference;         /* pull: bound of the distance of reference positions from the exact ones, pixels */
   double exact_share;        /* of the lattice cells traced pixel by pixel; 1 with the exact method */
   int64_t folded_cells;      /* of the mesh: the Jacobian determinant is not positive somewhere in them */
   double smallest_jacobian;  /* over the mesh */
@@ -311,15 +311,15 @@ typedef struct echospline_picture_report {
 
 typedef struct echospline_picture echospline_picture;
 
-/* Fill options with: grey 8-bit pixels, linear, border 0, automatic method, best level, origins 0. Sizes and spacings have to be set.
- * Does nothing when options is NULL or its struct_size is not set. */
+/* Fill options with: grey 8-bit pixels, linear, border 0, automatic method, best level, origins 0. Sizes and spacings
+ * have to be set. Does nothing when options is NULL or its struct_size is not set. */
 ECHOSPLINE_API void echospline_picture_defaults(echospline_picture_options* options);
 /* Fill a needle with an 18-gauge one of which every part is seen by a linear array. Entry and tip have to be set. */
 ECHOSPLINE_API void echospline_needle_defaults(echospline_needle* needle);
 
 /* A picture of undeformed tissue. The pixels (rows, columns, channels) are copied; all memory is allocated here. */
-ECHOSPLINE_API echospline_status echospline_picture_create(const echospline_picture_options* options, const void* pixels,
-                                                           echospline_picture** picture);
+ECHOSPLINE_API echospline_status echospline_picture_create(const echospline_picture_options* options,
+                                                           const void* pixels, echospline_picture** picture);
 ECHOSPLINE_API void echospline_picture_destroy(echospline_picture* picture);
 ECHOSPLINE_API const char* echospline_picture_message(const echospline_picture* picture);
 ECHOSPLINE_API int32_t echospline_picture_level(const echospline_picture* picture);
@@ -327,19 +327,25 @@ ECHOSPLINE_API int32_t echospline_picture_level(const echospline_picture* pictur
 ECHOSPLINE_API int64_t echospline_picture_size(const echospline_picture* picture);
 
 /* Replace the reference by pixels of the same layout; bytes: how many there are. */
-ECHOSPLINE_API echospline_status echospline_picture_reference(echospline_picture* picture, const void* pixels, int64_t bytes);
+ECHOSPLINE_API echospline_status echospline_picture_reference(echospline_picture* picture, const void* pixels,
+                                                              int64_t bytes);
 /* Deform by the displacement of the mesh nodes, (count / 2, 2) mm. */
-ECHOSPLINE_API echospline_status echospline_picture_deform(echospline_picture* picture, const double* displacement, int64_t count);
-ECHOSPLINE_API echospline_status echospline_picture_deform_single(echospline_picture* picture, const float* displacement,
-                                                                  int64_t count);
+ECHOSPLINE_API echospline_status echospline_picture_deform(echospline_picture* picture, const double* displacement,
+                                                           int64_t count);
+ECHOSPLINE_API echospline_status echospline_picture_deform_single(echospline_picture* picture,
+                                                                  const float* displacement, int64_t count);
 
 /* Draw into bytes of the caller's; needle may be NULL. */
-ECHOSPLINE_API echospline_status echospline_picture_draw(echospline_picture* picture, const echospline_needle* needle, void* out,
-                                                         int64_t bytes);
+ECHOSPLINE_API echospline_status echospline_picture_draw(echospline_picture* picture, const echospline_needle* needle,
+                                                         void* out, int64_t bytes);
 /* Where each pixel comes from, exactly, as column and row of the reference, (rows, columns); NaN where no tissue is. */
-ECHOSPLINE_API echospline_status echospline_picture_inverse(echospline_picture* picture, float* x, float* y, int64_t count);
-ECHOSPLINE_API echospline_status echospline_picture_check(echospline_picture* picture, echospline_picture_report* report);
-/* Echo at points (point_count, 2) mm of the plane: its power relative to white, and the share of the tissue's power that passes the needle. */
+ECHOSPLINE_API echospline_status echospline_picture_inverse(echospline_picture* picture, float* x, float* y,
+                                                            int64_t count);
+/* Check the inverse against the forward map, and find folds. */
+ECHOSPLINE_API echospline_status echospline_picture_check(echospline_picture* picture,
+                                                          echospline_picture_report* report);
+/* Echo at points (point_count, 2) mm of the plane: its power relative to white, and the share of the tissue's power
+ * that passes the needle. */
 ECHOSPLINE_API echospline_status echospline_picture_echo(echospline_picture* picture, const echospline_needle* needle,
                                                          const double* points, int64_t point_count, double* power,
                                                          double* transmission);

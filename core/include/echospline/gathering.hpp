@@ -50,11 +50,11 @@ ECHOSPLINE_INLINE Floats spread(Floats v) {
   if constexpr (STEP == 1) return v;
 #if defined(__AVX512F__)
   else if constexpr (STEP == 4)
-    return __builtin_shufflevector(v, v, from, from, from, from, from + 1, from + 1, from + 1, from + 1, from + 2, from + 2, from + 2,
-                                   from + 2, from + 3, from + 3, from + 3, from + 3);
+    return __builtin_shufflevector(v, v, from, from, from, from, from + 1, from + 1, from + 1, from + 1, from + 2,
+                                   from + 2, from + 2, from + 2, from + 3, from + 3, from + 3, from + 3);
   else
-    return __builtin_shufflevector(v, v, from, from, from + 1, from + 1, from + 2, from + 2, from + 3, from + 3, from + 4, from + 4,
-                                   from + 5, from + 5, from + 6, from + 6, from + 7, from + 7);
+    return __builtin_shufflevector(v, v, from, from, from + 1, from + 1, from + 2, from + 2, from + 3, from + 3,
+                                   from + 4, from + 4, from + 5, from + 5, from + 6, from + 6, from + 7, from + 7);
 #elif defined(__AVX2__)
   else if constexpr (STEP == 4)
     return __builtin_shufflevector(v, v, from, from, from, from, from + 1, from + 1, from + 1, from + 1);

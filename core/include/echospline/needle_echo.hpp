@@ -1,11 +1,13 @@
-// Echo of a needle in the imaging plane: one line from its near wall, the bevel, a ring-down tail, and a shadow. In the plane and across it.
+// Echo of a needle in the imaging plane: one line from its near wall, the bevel, a ring-down tail, and a shadow. In the
+// plane and across it.
 //
-// A pixel sees the needle through the resolution Q = diag(1/lateral^2, 1/axial^2, 1/elevation(depth)^2) in axes across the beam, along it
-// and out of the plane. With r from the entry to the pixel and u along the needle, the power of a line is
+// A pixel sees the needle through the resolution Q = diag(1/lateral^2, 1/axial^2, 1/elevation(depth)^2) in axes across
+// the beam, along it and out of the plane. With r from the entry to the pixel and u along the needle, the power of a
+// line is
 //     exp(-(rQr - (rQu)^2 / uQu)) P(s),   s = rQu / uQu,   seen with resolution (uQu)^-1/2 along the needle.
-// P depends on the place on the needle alone, with all that depends on angles in it: it is tabulated once per needle position, and a pixel costs
-// one exponential and one look-up. Powers are relative to white; they add to the tissue's power before log compression.
-// Grain is a table fixed to the needle's tip, so nothing shimmers as the needle moves.
+// P depends on the place on the needle alone, with all that depends on angles in it: it is tabulated once per needle
+// position, and a pixel costs one exponential and one look-up. Powers are relative to white; they add to the tissue's
+// power before log compression. Grain is a table fixed to the needle's tip, so nothing shimmers as the needle moves.
 #pragma once
 #include "array.hpp"
 #include "echospline.h"
@@ -13,23 +15,23 @@
 
 namespace echospline::ECHOSPLINE_CORE {
 
-constexpr float GRAIN = 0.05f;           // mm between entries of the tables: a third of the finest resolution
-constexpr int NOISE_COUNT = 4096;        // entries of the noise tables, a power of two: 205 mm until they repeat
-constexpr int NOISE_EXTRA = 1024;        // first entries repeated behind the last, so that smoothing reads on
-constexpr int LOOKS = 2;                 // independent speckle patterns that are averaged
-constexpr int MOST_TAPS = 480;           // half width of the smoothing, entries
-constexpr int PROFILE_COUNT = 8192;      // most entries of P
-constexpr int KNOTS = 33;                // places on the needle at which angles are evaluated
-constexpr int TAIL_COUNT = 256;          // entries along the ring-down
-constexpr float REACH = 4.2f;            // sigmas at which exp(-q) is 77 dB down: weaker echoes are not drawn
-constexpr float TAIL_END = -55.0f;       // dB at which the ring-down ends: below the tissue, and each millimetre more costs time
-constexpr float COMB = 0.34f;            // mm between rungs of the tail: 0.27 diameters of an 18-gauge needle with its stylet
-constexpr float BEVEL_LENGTH = 1.8f;     // diameters
-constexpr float ROUND = 10.0f;           // dB more grain from a shaft across the plane: its round near side lies in one resolution cell
-constexpr float BEVEL_LOSS = 12.0f;      // dB of the mirror echo lost on the bevel, which faces elsewhere: the line ends at the heel
-constexpr float HEEL = 12.0f;            // dB by which the heel is weaker than the tip
-constexpr float ONSET = 0.8f;            // mm below the shaft at which half of the shadow has set in: no hard black edge
-constexpr float GROUND = 0.05f;          // mm: rays are followed up from this far above a pixel
+constexpr float GRAIN = 0.05f;        // mm between entries of the tables: a third of the finest resolution
+constexpr int NOISE_COUNT = 4096;     // entries of the noise tables, a power of two: 205 mm until they repeat
+constexpr int NOISE_EXTRA = 1024;     // first entries repeated behind the last, so that smoothing reads on
+constexpr int LOOKS = 2;              // independent speckle patterns that are averaged
+constexpr int MOST_TAPS = 480;        // half width of the smoothing, entries
+constexpr int PROFILE_COUNT = 8192;   // most entries of P
+constexpr int KNOTS = 33;             // places on the needle at which angles are evaluated
+constexpr int TAIL_COUNT = 256;       // entries along the ring-down
+constexpr float REACH = 4.2f;         // sigmas at which exp(-q) is 77 dB down: weaker echoes are not drawn
+constexpr float TAIL_END = -55.0f;    // dB at which the ring-down ends, below the tissue: each millimetre costs time
+constexpr float COMB = 0.34f;         // mm between rungs of the tail: 0.27 diameters, 18 gauge with its stylet
+constexpr float BEVEL_LENGTH = 1.8f;  // diameters
+constexpr float ROUND = 10.0f;        // dB more grain across the plane: one resolution cell holds all of the near side
+constexpr float BEVEL_LOSS = 12.0f;   // dB of the mirror echo lost on the bevel, which faces elsewhere
+constexpr float HEEL = 12.0f;         // dB by which the heel is weaker than the tip
+constexpr float ONSET = 0.8f;         // mm from the shaft at which half of the shadow has set in: no black edge
+constexpr float GROUND = 0.05f;       // mm: rays are followed up from this far above a pixel
 
 /// The grain of a needle.
 struct Noise {
@@ -76,9 +78,7 @@ struct Noise {
     for (int k = 0; k < NOISE_COUNT; ++k) value += share * (table[start + k * step] - value);
     for (int k = 0; k < NOISE_COUNT; ++k) table[start + k * step] = value += share * (table[start + k * step] - value);
   }
-  static void repeat(float* table) {
-    std::memcpy(table + NOISE_COUNT, table, NOISE_EXTRA * sizeof(float));
-  }
+  static void repeat(float* table) { std::memcpy(table + NOISE_COUNT, table, NOISE_EXTRA * sizeof(float)); }
   static void fill(float* table, uint64_t& state, float sd) {
     for (int k = 0; k < NOISE_COUNT; ++k) table[k] = sd * normal(state);
     repeat(table);
@@ -158,7 +158,8 @@ class NeedleEcho {
     arrival_ = float(growth * growth * growth * growth);
     ql_ = float(1 / (needle.lateral * needle.lateral)), qa_ = float(1 / (needle.axial * needle.axial));
     elevation_ = float(needle.elevation), elevation_depth_ = float(needle.elevation_depth);
-    spread_ = float(0.42 * needle.element_height), steepest_ = float(0.5 / needle.f_number), opacity_ = float(needle.opacity);
+    spread_ = float(0.42 * needle.element_height), steepest_ = float(0.5 / needle.f_number),
+    opacity_ = float(needle.opacity);
     ux_ = float(u_[0]), uy_ = float(u_[1]), uz_ = float(u_[2]);
     ex_ = float(entry_[0]), ey_ = float(entry_[1]), ez_ = float(entry_[2]);
     spot_power_[0] = arrival_ * decibels(needle.bevel);
@@ -180,9 +181,13 @@ class NeedleEcho {
   bool shades() const { return (parts_ & ECHOSPLINE_SHADOW) && opacity_ > 0; }
 
   /// Power of shaft and tail relative to white, at points in mm; 0 outside the footprint.
-  ECHOSPLINE_INLINE Floats line(Floats x, Floats y) const { return curved_ ? line_in<true>(x, y) : line_in<false>(x, y); }
+  ECHOSPLINE_INLINE Floats line(Floats x, Floats y) const {
+    return curved_ ? line_in<true>(x, y) : line_in<false>(x, y);
+  }
   /// Power of the tip (0) or the heel (1); 0 further than `spot_reach` away.
-  ECHOSPLINE_INLINE Floats spot(int k, Floats x, Floats y) const { return curved_ ? spot_in<true>(k, x, y) : spot_in<false>(k, x, y); }
+  ECHOSPLINE_INLINE Floats spot(int k, Floats x, Floats y) const {
+    return curved_ ? spot_in<true>(k, x, y) : spot_in<false>(k, x, y);
+  }
   int spots() const { return (parts_ & ECHOSPLINE_BEVEL) ? 2 : 0; }
   double spot_x(int k) const { return spot_[k][0]; }
   double spot_y(int k) const { return spot_[k][1]; }
@@ -254,7 +259,8 @@ class NeedleEcho {
     Floats power = Floats{};
     // the near wall: the axis shifted by a radius against the beam, at right angles to the needle
     const float radius = float(radius_);
-    const Floats shift = radius * v.ua, rl = v.rl - shift * v.ul, ra = v.ra + radius - shift * v.ua, rz = -ez_ - shift * uz_;
+    const Floats shift = radius * v.ua, rl = v.rl - shift * v.ul, ra = v.ra + radius - shift * v.ua,
+                 rz = -ez_ - shift * uz_;
     const Floats along_l = ql_ * v.ul * v.ul, along_z = qe * (uz_ * uz_), uqu = along_l + qa_ * v.ua * v.ua + along_z;
     const Floats per = 1.0f / uqu, s = (ql_ * rl * v.ul + qa_ * ra * v.ua + qe * rz * uz_) * per;
     const Floats la = rl * v.ua - ra * v.ul, lz = rl * uz_ - rz * v.ul, az = ra * uz_ - rz * v.ua;
@@ -269,7 +275,8 @@ class NeedleEcho {
         const Ints i = to_ints(k);
         const Floats low = gather(tables_.ring_down.data(), i), high = gather(tables_.ring_down.data() + 1, i);
         const Floats off = greatest(q - t * (2.0f * b - a * t), all(0.0f));
-        power += (low + (k - to_floats(i)) * (high - low)) * exp_minus(off) * along(tables_.tail_profile.data(), s - t * qa_ * v.ua * per);
+        power += (low + (k - to_floats(i)) * (high - low)) * exp_minus(off) *
+                 along(tables_.tail_profile.data(), s - t * qa_ * v.ua * per);
       }
     }
     return power;
@@ -284,7 +291,8 @@ class NeedleEcho {
     return spot_power_[k] * exp_minus(ql_ * l * l + qa_ * a * a + at[2] * at[2] / slice_square(v.depth));
   }
 
-  /// The share of the rays between a pixel and its aperture that the shaft blocks, times the share of the slice that it covers.
+  /// The share of the rays between a pixel and its aperture that the shaft blocks, times the share of the slice that it
+  /// covers.
   template <bool CURVED>
   ECHOSPLINE_INLINE Floats shade_in(Floats x, Floats y) const {
     const View v = view<CURVED>(x, y);
@@ -302,7 +310,8 @@ class NeedleEcho {
     // slopes of the rays to its ends, widened by its thickness
     const Floats up0 = greatest(v.ra - from * v.ua, all(GROUND)), up1 = greatest(v.ra - to * v.ua, all(GROUND));
     const Floats slope0 = (v.rl - from * v.ul) / up0, slope1 = (v.rl - to * v.ul) / up1;
-    const Floats wide0 = 0.5f * diameter / greatest(up0, all(diameter)), wide1 = 0.5f * diameter / greatest(up1, all(diameter));
+    const Floats wide0 = 0.5f * diameter / greatest(up0, all(diameter)),
+                 wide1 = 0.5f * diameter / greatest(up1, all(diameter));
     const Floats low = least(slope0 - wide0, slope1 - wide1), high = greatest(slope0 + wide0, slope1 + wide1);
     const float per = 0.5f / steepest_;
     const Floats blocked = smooth_step(high * per + 0.5f) - smooth_step(low * per + 0.5f);
@@ -313,8 +322,10 @@ class NeedleEcho {
     const Floats height = greatest(v.ra - s * v.ua, all(0.0f)), z = ez_ + s * uz_;
     const Floats fan = spread_ * height / greatest(v.depth, all(1.0f));
     const Floats per_slice = 0.70710678f / root(fan * fan + elevation_ * elevation_);
-    const Floats flat = root(v.ul * v.ul + uz_ * uz_), half = 0.5f * diameter * flat / greatest(magnitude(v.ul), all(1e-3f)) + 1e-6f;
-    const Floats covered = 0.5f * (rough_error_function((z + half) * per_slice) - rough_error_function((z - half) * per_slice));
+    const Floats flat = root(v.ul * v.ul + uz_ * uz_),
+                 half = 0.5f * diameter * flat / greatest(magnitude(v.ul), all(1e-3f)) + 1e-6f;
+    const Floats covered =
+        0.5f * (rough_error_function((z + half) * per_slice) - rough_error_function((z - half) * per_slice));
     // distance from the shaft in the plane: the shadow sets in gradually
     const float in_plane = ux_ * ux_ + uy_ * uy_;
     const Floats on = within((v.rl * v.ul + v.ra * v.ua) * (1.0f / (in_plane + 1e-6f)), 0.0f, length);
@@ -336,7 +347,8 @@ class NeedleEcho {
     const double slice = slice_at(beam.depth), uqu = ql_ * ul * ul + qa_ * ua * ua + uz * uz / (slice * slice);
     const double sigma = 1 / __builtin_sqrt(uqu), lateral = n.lateral;
     const double tilt = degree * __builtin_asin(larger(-1.0, smaller(1.0, ua))), flat = larger(1e-9, ul * ul + uz * uz);
-    const double width = __builtin_sqrt((ul * ul * n.lobe * n.lobe + uz * uz * n.lobe_elevation * n.lobe_elevation) / flat);
+    const double width =
+        __builtin_sqrt((ul * ul * n.lobe * n.lobe + uz * uz * n.lobe_elevation * n.lobe_elevation) / flat);
     const double in_plane = ul / __builtin_sqrt(flat);
     double mirror = 0;
     for (int look = -1; look <= 1; ++look) {
@@ -345,8 +357,10 @@ class NeedleEcho {
     }
     const double step = larger(0.0, smaller(1.0, ((tilt < 0 ? -tilt : tilt) - 50) / 40)), off = tilt / (0.4 * width);
     Knot k;
-    k.specular = float(n.specular + 10 * __builtin_log10(mirror + 1e-12) + 20 * __builtin_log10(smaller(1.0, sigma / lateral)));
-    k.rough = float(n.roughness - n.rolloff * step + 10 * __builtin_log10(smaller(1.5, sigma / lateral)) + ROUND * uz * uz);
+    k.specular =
+        float(n.specular + 10 * __builtin_log10(mirror + 1e-12) + 20 * __builtin_log10(smaller(1.0, sigma / lateral)));
+    k.rough =
+        float(n.roughness - n.rolloff * step + 10 * __builtin_log10(smaller(1.5, sigma / lateral)) + ROUND * uz * uz);
     k.tail = float(n.specular + n.ring_down - 4.343 * off * off);  // to and fro needs a square hit
     k.sigma = float(sigma);
     k.steady = float(0.03 + 0.9 * uz * uz);  // across the plane many scatterers share a resolution cell
@@ -357,8 +371,10 @@ class NeedleEcho {
   bool visible(const Extent& extent, double margin, double pad, double& first, double& last) const {
     first = -pad, last = length_ + pad;
     const double deepest = larger(slice_at(extent.top), slice_at(extent.bottom));
-    const double reach = (REACH + 0.3) * (curved_ ? larger(deepest, slice_at(extent.bottom - extent.top)) : deepest) + radius_;
-    const double low[3] = {extent.left - margin, extent.top - margin, -reach}, high[3] = {extent.right + margin, extent.bottom + margin, reach};
+    const double reach =
+        (REACH + 0.3) * (curved_ ? larger(deepest, slice_at(extent.bottom - extent.top)) : deepest) + radius_;
+    const double low[3] = {extent.left - margin, extent.top - margin, -reach},
+                 high[3] = {extent.right + margin, extent.bottom + margin, reach};
     for (int k = 0; k < 3; ++k) {
       if (u_[k] < 1e-9 && u_[k] > -1e-9) {
         if (entry_[k] < low[k] || entry_[k] > high[k]) return false;
@@ -374,7 +390,8 @@ class NeedleEcho {
     if (!(parts_ & (ECHOSPLINE_SHAFT | ECHOSPLINE_TAIL))) return;
     const double widest = larger(n.lateral, n.axial), deepest = larger(slice_at(extent.top), slice_at(extent.bottom));
     const double pad = 5 * larger(widest, u_[2] * u_[2] > 1e-4 ? deepest : 0.0);
-    const double longest_tail = (parts_ & ECHOSPLINE_TAIL) ? larger(0.0, (n.specular + n.ring_down - TAIL_END) / n.ring_down_loss) : 0.0;
+    const double longest_tail =
+        (parts_ & ECHOSPLINE_TAIL) ? larger(0.0, (n.specular + n.ring_down - TAIL_END) / n.ring_down_loss) : 0.0;
     double first, last;
     if (!visible(extent, REACH * widest + n.diameter + longest_tail, pad, first, last)) return;
 
@@ -393,7 +410,8 @@ class NeedleEcho {
     const double flat = __builtin_sqrt(u_[0] * u_[0] + u_[1] * u_[1]);
     double finest = 1e9;
     for (int k = 0; k < KNOTS; ++k) finest = smaller(finest, double(knots[k].sigma));
-    footprint_.radius = REACH * smaller(widest, n.lateral * n.axial / (finest * larger(flat, 1e-6))) + (curved_ ? 0.2 * radius_ : 0.0);
+    footprint_.radius =
+        REACH * smaller(widest, n.lateral * n.axial / (finest * larger(flat, 1e-6))) + (curved_ ? 0.2 * radius_ : 0.0);
     for (int side = 0; side < 2; ++side) {
       const double s = side ? last : first;
       double x = entry_[0] + s * u_[0], y = entry_[1] + s * u_[1], wall[2];
@@ -424,7 +442,8 @@ class NeedleEcho {
       Floats specular, rough, tail, sigma, steady;
       for (int lane = 0; lane < LANES; ++lane) {
         const Knot &a = knots[i[lane]], &b = knots[i[lane] + 1];
-        specular[lane] = a.specular + f[lane] * (b.specular - a.specular), rough[lane] = a.rough + f[lane] * (b.rough - a.rough);
+        specular[lane] = a.specular + f[lane] * (b.specular - a.specular),
+        rough[lane] = a.rough + f[lane] * (b.rough - a.rough);
         tail[lane] = a.tail + f[lane] * (b.tail - a.tail), sigma[lane] = a.sigma + f[lane] * (b.sigma - a.sigma);
         steady[lane] = a.steady + f[lane] * (b.steady - a.steady);
       }
@@ -455,8 +474,10 @@ class NeedleEcho {
       const Floats within_shaft = smooth_step(s * 0.5f) * smooth_step((length - s) * 0.5f);  // no hard edge of the tail
       // the mirror echo fades over the bevel and towards both ends
       const float bevel = float(BEVEL_LENGTH * n.diameter);
-      const Floats fade = -BEVEL_LOSS * exp_minus(greatest(v, all(0.0f)) * (1.4f / bevel)) - 4.0f * exp_minus(greatest(s, all(0.0f)) * 0.3f);
-      const Floats mirror = power_of(specular + fade), grain = power_of(rough) * (1.0f - steady) * patch * (per_norm * per_norm);
+      const Floats fade = -BEVEL_LOSS * exp_minus(greatest(v, all(0.0f)) * (1.4f / bevel)) -
+                          4.0f * exp_minus(greatest(s, all(0.0f)) * 0.3f);
+      const Floats mirror = power_of(specular + fade),
+                   grain = power_of(rough) * (1.0f - steady) * patch * (per_norm * per_norm);
       Floats cross = Floats{}, square = Floats{};
       for (int look = 0; look < LOOKS; ++look)
         cross += real[look], square += real[look] * real[look] + imaginary[look] * imaginary[look];
@@ -468,7 +489,8 @@ class NeedleEcho {
     if (rings_) tabulate_ring_down(n, noise);
   }
 
-  /// The tail below a shaft that lies across the beam: rungs of uneven height and distance, weaker with every millimetre.
+  /// The tail below a shaft that lies across the beam: rungs of uneven height and distance, weaker with every
+  /// millimetre.
   void tabulate_ring_down(const echospline_needle& n, const Noise& noise) {
     per_ring_ = (TAIL_COUNT - 1) / tail_length_;
     const float *shift = noise.patch.data() + NOISE_COUNT / 3, *height = noise.patch.data() + 2 * NOISE_COUNT / 3;
@@ -477,8 +499,10 @@ class NeedleEcho {
       const float t = k / per_ring_;
       const int at = smaller(int(t / GRAIN), NOISE_COUNT / 3 - 1);
       const float wave = 0.5f + 0.5f * __builtin_cosf(6.2831853f * (t / COMB + 0.4f * shift[at]));
-      const float comb = (0.6f + 0.4f * wave * wave) * __builtin_expf(0.35f * height[at]), rise = smaller(1.0f, t / 0.3f);
-      const float left = larger(0.0f, 1 - t / tail_length_), end = smaller(1.0f, 4 * left);  // fades out over its last quarter
+      const float comb = (0.6f + 0.4f * wave * wave) * __builtin_expf(0.35f * height[at]),
+                  rise = smaller(1.0f, t / 0.3f);
+      const float left = larger(0.0f, 1 - t / tail_length_),
+                  end = smaller(1.0f, 4 * left);  // fades out over its last quarter
       ring[k] = rise * end * comb * comb * decibels(-n.ring_down_loss * t);
     }
   }

@@ -30,21 +30,25 @@ class Picture {
     room_ = rounded_up(columns_, LATTICE * LANES) + LANES;
     raster_ = Raster::of(LATTICE, columns_, rows_);
     cell_columns_ = larger(1, raster_.columns - 1), cell_rows_ = larger(1, raster_.rows - 1);
-    lattice_room_ = rounded_up(cell_columns_ + 1, LANES) + 4 * LANES;  // margins: LANES before a row, and more behind it
+    // margins: LANES before a row, and more behind it
+    lattice_room_ = rounded_up(cell_columns_ + 1, LANES) + 4 * LANES;
     const int64_t pixel_count = int64_t(columns_) * rows_;
     const bool bytes = o_.pixel_type == ECHOSPLINE_UINT8;
     Mesh& m = mesh_;
     m.nx = o_.mesh_shape[0], m.ny = o_.mesh_shape[1], m.stride = rounded_up(m.nx, LANES) + LANES;
-    m.x0 = float((o_.mesh_origin[0] - o_.origin[0]) / o_.spacing[0]), m.y0 = float((o_.mesh_origin[1] - o_.origin[1]) / o_.spacing[1]);
+    m.x0 = float((o_.mesh_origin[0] - o_.origin[0]) / o_.spacing[0]),
+    m.y0 = float((o_.mesh_origin[1] - o_.origin[1]) / o_.spacing[1]);
     m.hx = float(o_.mesh_spacing[0] / o_.spacing[0]), m.hy = float(o_.mesh_spacing[1] / o_.spacing[1]);
     m.slack = 5e-7f * float(larger(columns_, rows_) + 32);
-    exact_ = o_.method == ECHOSPLINE_METHOD_EXACT || (o_.method == ECHOSPLINE_METHOD_AUTO && (m.hx < LATTICE || m.hy < LATTICE));
+    exact_ = o_.method == ECHOSPLINE_METHOD_EXACT ||
+             (o_.method == ECHOSPLINE_METHOD_AUTO && (m.hx < LATTICE || m.hy < LATTICE));
 
-    const bool there = ux_.reserve((m.ny + 3) * m.stride) && uy_.reserve((m.ny + 3) * m.stride) && x_.reserve(rows_ * room_) &&
-                       y_.reserve(rows_ * room_) && lattice_x_.reserve((cell_rows_ + 4) * lattice_room_) &&
-                       lattice_y_.reserve((cell_rows_ + 4) * lattice_room_) && marks_.reserve(cell_rows_ * lattice_room_ + 8) &&
-                       row_.reserve(2 * (room_ + LATTICE * LANES)) && values_.reserve(3 * room_ + 4 * LANES) &&
-                       true && noise_.reserve() && tables_.reserve() &&
+    const bool there = ux_.reserve((m.ny + 3) * m.stride) && uy_.reserve((m.ny + 3) * m.stride) &&
+                       x_.reserve(rows_ * room_) && y_.reserve(rows_ * room_) &&
+                       lattice_x_.reserve((cell_rows_ + 4) * lattice_room_) &&
+                       lattice_y_.reserve((cell_rows_ + 4) * lattice_room_) &&
+                       marks_.reserve(cell_rows_ * lattice_room_ + 8) && row_.reserve(2 * (room_ + LATTICE * LANES)) &&
+                       values_.reserve(3 * room_ + 4 * LANES) && true && noise_.reserve() && tables_.reserve() &&
                        (bytes ? words_.reserve(channels_ * pixel_count)
                               : planes_.reserve(channels_ * int64_t(columns_ + 1) * (rows_ + 1)));
     if (!there) return false;
@@ -60,16 +64,22 @@ class Picture {
     return true;
   }
 
-  int64_t size() const { return int64_t(columns_) * rows_ * (o_.border == ECHOSPLINE_BORDER_TRANSPARENT ? 4 : channels_) * pixel_size(o_.pixel_type); }
+  int64_t size() const {
+    return int64_t(columns_) * rows_ * (o_.border == ECHOSPLINE_BORDER_TRANSPARENT ? 4 : channels_) *
+           pixel_size(o_.pixel_type);
+  }
 
   void set_reference(const void* pixels) {
     for (int c = 0; c < channels_; ++c) {
       float* plane = planes_.data() + c * int64_t(columns_ + 1) * (rows_ + 1);
       switch (o_.pixel_type) {
         case ECHOSPLINE_UINT8:
-          pack(static_cast<const uint8_t*>(pixels), channels_, c, columns_, rows_, words_.data() + c * int64_t(columns_) * rows_);
+          pack(static_cast<const uint8_t*>(pixels), channels_, c, columns_, rows_,
+               words_.data() + c * int64_t(columns_) * rows_);
           break;
-        case ECHOSPLINE_UINT16: unpack(static_cast<const uint16_t*>(pixels), channels_, c, columns_, rows_, plane); break;
+        case ECHOSPLINE_UINT16:
+          unpack(static_cast<const uint16_t*>(pixels), channels_, c, columns_, rows_, plane);
+          break;
         case ECHOSPLINE_INT16: unpack(static_cast<const int16_t*>(pixels), channels_, c, columns_, rows_, plane); break;
         default: unpack(static_cast<const float*>(pixels), channels_, c, columns_, rows_, plane);
       }
@@ -126,7 +136,8 @@ class Picture {
     }
   }
 
-  void echo_at(const echospline_needle& needle, const double* points, int64_t count, double* power, double* transmission) {
+  void echo_at(const echospline_needle& needle, const double* points, int64_t count, double* power,
+               double* transmission) {
     noise_.make(needle.seed);
     Extent extent = {1e30, -1e30, 1e30, -1e30};
     for (int64_t k = 0; k < count; ++k) {
@@ -137,7 +148,8 @@ class Picture {
     for (int64_t k = 0; k < count; k += LANES) {
       const int held = int(smaller<int64_t>(LANES, count - k));
       Floats x = Floats{}, y = Floats{};
-      for (int lane = 0; lane < held; ++lane) x[lane] = float(points[2 * (k + lane)]), y[lane] = float(points[2 * (k + lane) + 1]);
+      for (int lane = 0; lane < held; ++lane)
+        x[lane] = float(points[2 * (k + lane)]), y[lane] = float(points[2 * (k + lane) + 1]);
       Floats light = echo.footprint().count ? echo.line(x, y) : Floats{};
       for (int spot = 0; spot < echo.spots(); ++spot) light += echo.spot(spot, x, y);
       const Floats passed = echo.shades() ? power_of(echo.shade(x, y)) : all(1.0f);
@@ -183,17 +195,22 @@ class Picture {
   }
   /// The last points were traced at the last pixels, which may be less than a step away: move them on to a whole step.
   void extend(float* p, int64_t stride) const {
-    const int across = raster_.last_column - (cell_columns_ - 1) * LATTICE, down = raster_.last_row - (cell_rows_ - 1) * LATTICE;
+    const int across = raster_.last_column - (cell_columns_ - 1) * LATTICE,
+              down = raster_.last_row - (cell_rows_ - 1) * LATTICE;
     for (int row = 0; row < raster_.rows; ++row) {
       float* last = p + row * stride + cell_columns_;
-      if (across == 0) last[0] = last[-1];
-      else if (across < LATTICE) last[0] = last[-1] + (last[0] - last[-1]) * (float(LATTICE) / across);
+      if (across == 0)
+        last[0] = last[-1];
+      else if (across < LATTICE)
+        last[0] = last[-1] + (last[0] - last[-1]) * (float(LATTICE) / across);
       last[1] = last[0];  // a last pixel that is a lattice point has no next one
     }
     float *last = p + cell_rows_ * stride, *before = last - stride;
     for (int k = 0; k <= cell_columns_ && down < LATTICE; ++k) {
-      if (down == 0) last[k] = before[k];
-      else last[k] = before[k] + (last[k] - before[k]) * (float(LATTICE) / down);
+      if (down == 0)
+        last[k] = before[k];
+      else
+        last[k] = before[k] + (last[k] - before[k]) * (float(LATTICE) / down);
     }
   }
   /// Call `visit` with the first pixel and the number of pixels of each marked lattice cell of a row of pixels.
@@ -225,7 +242,9 @@ class Picture {
     for (int k = 0; k * LATTICE < columns_; k += LANES) {
       const Floats a = load(above + k), b = load(above + k + 1);
       const Floats from = a + f * (load(below + k) - a), to = b + f * (load(below + k + 1) - b);
-      spread_line<LATTICE>(from, to - from, [&](int part, Floats v) __attribute__((always_inline)) { store(out + k * LATTICE + part * LANES, v); });
+      spread_line<LATTICE>(from, to - from, [&](int part, Floats v) __attribute__((always_inline)) {
+        store(out + k * LATTICE + part * LANES, v);
+      });
     }
   }
 
@@ -241,7 +260,8 @@ class Picture {
         const Floats x = float(o_.origin[0]) + (counted() + float(k)) * float(shade_step_ * o_.spacing[0]);
         const Floats loss = echo.shade(x, y);
         store(shade + k, loss * per_decibel);
-        if (any(loss < -0.003f)) reach.first = smaller(reach.first, k), reach.last = smaller(k + LANES - 1, shade_columns_ - 1);
+        if (any(loss < -0.003f))
+          reach.first = smaller(reach.first, k), reach.last = smaller(k + LANES - 1, shade_columns_ - 1);
       }
     }
   }
@@ -267,14 +287,16 @@ class Picture {
   }
 
   /// Shadow and echo of a row; with `tissue`, only where it is not NaN.
-  void draw_needle(const NeedleEcho& __restrict echo, float range, int row, const float* tissue, float* __restrict values) {
+  void draw_needle(const NeedleEcho& __restrict echo, float range, int row, const float* tissue,
+                   float* __restrict values) {
     if (shade_step_ == 4) shade_pixels<4>(row, values);
     if (shade_step_ == 2) shade_pixels<2>(row, values);
     if (shade_step_ == 1) shade_pixels<1>(row, values);
     const double y = o_.origin[1] + row * o_.spacing[1];
     double first, last;
     if (echo.footprint().interval(y, first, last))
-      add_power(first, last, range, tissue, values, [&](Floats x) __attribute__((always_inline)) { return echo.line(x, all(float(y))); });
+      add_power(first, last, range, tissue, values,
+                [&](Floats x) __attribute__((always_inline)) { return echo.line(x, all(float(y))); });
     const double reach = echo.spot_reach();
     for (int k = 0; k < echo.spots(); ++k)
       if (y > echo.spot_y(k) - reach && y < echo.spot_y(k) + reach)
@@ -283,7 +305,8 @@ class Picture {
   }
   /// Add the power between two places of a row, mm, to its values.
   template <class Power>
-  ECHOSPLINE_INLINE void add_power(double first, double last, float range, const float* tissue, float* __restrict values, Power power_at) {
+  ECHOSPLINE_INLINE void add_power(double first, double last, float range, const float* tissue,
+                                   float* __restrict values, Power power_at) {
     const double per = 1 / o_.spacing[0];
     const int begin = int(larger(0.0, smaller((first - o_.origin[0]) * per, double(columns_))));
     const int end = int(larger(0.0, smaller((last - o_.origin[0]) * per + 1, double(columns_))));
@@ -291,7 +314,8 @@ class Picture {
       Floats power = power_at(float(o_.origin[0]) + (counted() + float(k)) * float(o_.spacing[0]));
       if (tissue) power = pick(load(tissue + k) == load(tissue + k), power, Floats{});
       if (!any(power > 1e-8f)) continue;
-      for (int c = 0; c < channels_; ++c) store(values + c * room_ + k, with_echo(load(values + c * room_ + k), power, white_, range));
+      for (int c = 0; c < channels_; ++c)
+        store(values + c * room_ + k, with_echo(load(values + c * room_ + k), power, white_, range));
     }
   }
 
@@ -305,7 +329,8 @@ class Picture {
         x = room_x, y = room_y;
       }
       sample(x, y, border);
-      if (echo) draw_needle(*echo, range, row, o_.border == ECHOSPLINE_BORDER_TRANSPARENT ? x : nullptr, values_.data());
+      if (echo)
+        draw_needle(*echo, range, row, o_.border == ECHOSPLINE_BORDER_TRANSPARENT ? x : nullptr, values_.data());
       write(row, x, out);
     }
   }
@@ -316,10 +341,12 @@ class Picture {
       float* values = values_.data() + c * room_;
       if (o_.pixel_type == ECHOSPLINE_UINT8) {
         const Quads source = {words_.data() + c * int64_t(columns_) * rows_, columns_, rows_};
-        nearest ? sample_row<true>(source, x, y, columns_, border, values) : sample_row<false>(source, x, y, columns_, border, values);
+        nearest ? sample_row<true>(source, x, y, columns_, border, values)
+                : sample_row<false>(source, x, y, columns_, border, values);
       } else {
         const Plane source = {planes_.data() + c * int64_t(columns_ + 1) * (rows_ + 1), columns_, rows_};
-        nearest ? sample_row<true>(source, x, y, columns_, border, values) : sample_row<false>(source, x, y, columns_, border, values);
+        nearest ? sample_row<true>(source, x, y, columns_, border, values)
+                : sample_row<false>(source, x, y, columns_, border, values);
       }
     }
   }
@@ -335,9 +362,11 @@ class Picture {
   template <class Pixel>
   void write_as(int row, const float* x, void* out) {
     if (o_.border == ECHOSPLINE_BORDER_TRANSPARENT)
-      write_row_with_alpha(values_.data(), room_, channels_, x, columns_, static_cast<Pixel*>(out) + int64_t(row) * columns_ * 4);
+      write_row_with_alpha(values_.data(), room_, channels_, x, columns_,
+                           static_cast<Pixel*>(out) + int64_t(row) * columns_ * 4);
     else
-      write_row(values_.data(), room_, channels_, columns_, static_cast<Pixel*>(out) + int64_t(row) * columns_ * channels_);
+      write_row(values_.data(), room_, channels_, columns_,
+                static_cast<Pixel*>(out) + int64_t(row) * columns_ * channels_);
   }
 
   /// Columns of a row of the shadow's lattice that are not 0.
@@ -348,20 +377,21 @@ class Picture {
   echospline_picture_options o_ = {};
   Mesh mesh_ = {};
   Raster raster_ = {};
-  int columns_ = 0, rows_ = 0, channels_ = 1, cell_columns_ = 1, cell_rows_ = 1, shade_step_ = 4, shade_columns_ = 0, shade_rows_ = 0;
+  int columns_ = 0, rows_ = 0, channels_ = 1, cell_columns_ = 1, cell_rows_ = 1, shade_step_ = 4, shade_columns_ = 0,
+      shade_rows_ = 0;
   int64_t room_ = 0, lattice_room_ = 0, shade_room_ = 0;
   float white_ = 255;
   bool exact_ = true, traced_ = false, latticed_ = false;
   LatticeCheck check_;
-  Array<float> ux_, uy_;                     // displacement, pixels
-  Array<float> x_, y_;                       // exact map: of every pixel, or of those in marked cells
+  Array<float> ux_, uy_;  // displacement, pixels
+  Array<float> x_, y_;    // exact map: of every pixel, or of those in marked cells
   Array<float> lattice_x_, lattice_y_;
   Array<uint8_t> marks_;
-  Array<float> row_, values_;    // of the row that is drawn
+  Array<float> row_, values_;  // of the row that is drawn
   Array<float> shade_;
   Array<Reach> shaded_;
-  Array<uint32_t> words_;                    // reference: 8-bit pixels
-  Array<float> planes_;                      // reference: other types
+  Array<uint32_t> words_;  // reference: 8-bit pixels
+  Array<float> planes_;    // reference: other types
   Noise noise_;
   EchoTables tables_;
 };

@@ -1,7 +1,8 @@
 // Reference pixels, packed for sampling, and rows of the picture written in the pixels' own type.
 //
-// Pixels of 8 bits are packed once with their right, lower and lower right neighbours into one word, so that a sample is one load; other
-// types are kept as floats. Channels lie in planes of their own. Beyond the outermost centres the outermost pixel counts.
+// Pixels of 8 bits are packed once with their right, lower and lower right neighbours into one word, so that a sample
+// is one load; other types are kept as floats. Channels lie in planes of their own. Beyond the outermost centres the
+// outermost pixel counts.
 #pragma once
 #include "array.hpp"
 #include "gathering.hpp"
@@ -20,7 +21,8 @@ inline void pack(const uint8_t* pixels, int channels, int channel, int columns, 
     uint32_t* word = words + int64_t(row) * columns;
     for (int k = 0; k < columns; ++k) {
       const int64_t at = int64_t(k) * channels, next = k + 1 < columns ? at + channels : at;
-      word[k] = uint32_t(here[at]) | uint32_t(here[next]) << 8 | uint32_t(below[at]) << 16 | uint32_t(below[next]) << 24;
+      word[k] =
+          uint32_t(here[at]) | uint32_t(here[next]) << 8 | uint32_t(below[at]) << 16 | uint32_t(below[next]) << 24;
     }
   }
 }
@@ -57,7 +59,8 @@ ECHOSPLINE_INLINE Floats sample(const Quads& q, Floats x, Floats y) {
   const Words word = gather(q.words, p.row * q.columns + p.column);
   const Floats a = to_floats((Ints)(word & 255));
   if constexpr (NEAREST) return a;
-  const Floats b = to_floats((Ints)((word >> 8) & 255)), c = to_floats((Ints)((word >> 16) & 255)), d = to_floats((Ints)(word >> 24));
+  const Floats b = to_floats((Ints)((word >> 8) & 255)), c = to_floats((Ints)((word >> 16) & 255)),
+               d = to_floats((Ints)(word >> 24));
   const Floats top = a + p.across * (b - a), bottom = c + p.across * (d - c);
   return top + p.down * (bottom - top);
 }
@@ -134,7 +137,8 @@ inline void write_row(const float* values, int64_t room, int channels, int colum
 }
 /// Write a row of red, green, blue and alpha: 0 where positions are NaN, else full.
 template <class Pixel>
-inline void write_row_with_alpha(const float* values, int64_t room, int channels, const float* x, int columns, Pixel* out) {
+inline void write_row_with_alpha(const float* values, int64_t room, int channels, const float* x, int columns,
+                                 Pixel* out) {
   for (int k = 0; k < columns; ++k) {
     for (int c = 0; c < 3; ++c) out[4 * k + c] = pixel_of<Pixel>(values[(channels == 3 ? c : 0) * room + k]);
     out[4 * k + 3] = x[k] == x[k] ? static_cast<Pixel>(PixelRange<Pixel>::full) : Pixel{};
