@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ctypes as c
+import shutil
+import subprocess
 from typing import Any
 
 import cv2
@@ -190,9 +192,23 @@ def test_a_mesh_larger_than_the_picture_repeats_its_edge():
     np.testing.assert_array_equal(moved[:, :10], np.repeat(image[:, :1], 10, axis=1))
 
 
-def test_automatic_is_pull_unless_the_mesh_is_finer_than_the_lattice():
+def test_automatic_is_pull():
     assert Picture(speckle(), (21, 17)).check().method == PULL
-    assert Picture(speckle(), (COLUMNS, ROWS)).check().method == EXACT
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_bound_of_the_difference_holds_in_rough_fields(seed):
+    rng = np.random.default_rng(seed)
+    for mesh in ((12, 9), (45, 30), (120, 90)):
+        picture = Picture(speckle(), mesh, method=PULL)
+        rough = rng.uniform(-0.03, 0.03, (len(picture.nodes), 2)) * picture.options.mesh_spacing
+        u = bump(picture, 2.0, 5.0) + rough * rng.integers(0, 2)
+        x, y = picture.deform(u).inverse()
+        inside = ~np.isnan(x)
+        drawn_x, drawn_y = positions(u, mesh, PULL)
+        off = np.hypot(drawn_x - np.clip(x, 0, COLUMNS - 1), drawn_y - np.clip(y, 0, ROWS - 1))[inside]
+        assert off.max() <= picture.check().difference + 1e-3
+        assert off.max() < 0.1
 
 
 # ---- Folds ---------------------------------------------------------------------------------------------------------
@@ -208,18 +224,32 @@ def jacobian(picture: Picture, u: np.ndarray) -> np.ndarray:
     return np.stack([a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0] for a, b in pairs], axis=-1)
 
 
+def check_folds(picture: Picture, u: np.ndarray) -> Any:
+    """Compare the report with NumPy's reading."""
+    report = picture.deform(u).check()
+    theirs = jacobian(picture, u)
+    nx, ny = picture.options.mesh_shape
+    assert report.folded_cells == (theirs.min(axis=-1) <= 0).sum()
+    assert report.smallest_jacobian == pytest.approx(theirs.min(), abs=1e-5)
+    j, i, corner = np.unravel_index(theirs.argmin(), theirs.shape)
+    place = picture.nodes.reshape(ny, nx, 2)[j + corner // 2, i + corner % 2]
+    np.testing.assert_allclose(report.place, place, atol=1e-9)
+    return report
+
+
 @pytest.mark.parametrize("level", LEVELS)
 @pytest.mark.parametrize("amplitude", [1.0, 6.0, 8.0])
 def test_folds_are_those_of_numpy(level, amplitude):
     picture = Picture(speckle(), (21, 17), level=level)
-    u = bump(picture, amplitude)
-    report = picture.deform(u).check()
-    theirs = jacobian(picture, u)
-    assert report.folded_cells == (theirs.min(axis=-1) <= 0).sum()
-    assert report.smallest_jacobian == pytest.approx(theirs.min(), abs=1e-5)
-    j, i, corner = np.unravel_index(theirs.argmin(), theirs.shape)
-    place = picture.nodes.reshape(17, 21, 2)[j + corner // 2, i + corner % 2]
-    np.testing.assert_allclose(report.place, place, atol=1e-9)
+    report = check_folds(picture, bump(picture, amplitude))
+    assert (report.folded_cells > 0) == (amplitude > 5)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_place_of_the_worst_fold_is_the_right_corner(seed):
+    rng = np.random.default_rng(seed)
+    picture = Picture(speckle(), tuple(rng.integers(2, 40, 2)))
+    check_folds(picture, rng.uniform(-1.5, 1.5, (len(picture.nodes), 2)))
 
 
 @pytest.mark.parametrize("mesh", [(21, 17), (90, 80)])
@@ -743,6 +773,42 @@ def test_wrong_options_are_refused_by_name(name, value, status):
     assert got == status
     assert name.split("_")[0] in message
     assert "got" in message
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+@pytest.mark.parametrize("language", ["c", "c++"])
+def test_structs_are_those_of_the_header(tmp_path, language):
+    structs = {
+        "picture_options": native.PictureOptions,
+        "needle": native.Needle,
+        "picture_report": native.Report,
+    }
+    lines = [
+        f'_Static_assert(sizeof(echospline_{name}) == {c.sizeof(struct)}, "size");'
+        + "".join(
+            f'_Static_assert(offsetof(echospline_{name}, {field}) == {getattr(struct, field).offset}, "{field}");'
+            for field, _ in struct._fields_
+        )
+        for name, struct in structs.items()
+    ]
+    source = tmp_path / "header.c"
+    text = '#include <stddef.h>\n#include "echospline.h"\n' + "\n".join(lines)
+    source.write_text(text.replace("_Static_assert", "static_assert") if language == "c++" else text)
+    include = native.HERE / "core/include/echospline"
+    standard = "c17" if language == "c" else "c++20"
+    command = [
+        "cc",
+        "-x",
+        language,
+        f"-std={standard}",
+        "-Wall",
+        "-Werror",
+        "-pedantic",
+        f"-I{include}",
+        "-fsyntax-only",
+    ]
+    subprocess.run([*command, str(source)], check=True)
+    assert [c.sizeof(s) for s in structs.values()] == [128, 240, 64]
 
 
 def test_null_is_refused():

@@ -266,6 +266,7 @@ ECHOSPLINE_INLINE void trace_cells(const Mesh& m, int i, int j, const CellLanes&
       Floats s, t;
       invert<1>(c.bx, c.by, c.cx, c.cy, c.dx, c.dy, qx, qy, s, t);
       const Ints in = (s >= s0) & (s <= s1) & (t >= t0) & (t <= t1) & (column <= b.last) & (row <= b.last_row);
+      if (!any(in)) continue;
       scatter(pick(in, row * int32_t(out.stride) + column, nowhere), px + s * m.hx, py + t * m.hy, out.x, out.y);
     }
   }

@@ -238,7 +238,7 @@ enum {
   ECHOSPLINE_BORDER_TRANSPARENT = 1  /* red, green, blue and alpha are drawn; no needle outside tissue */
 };
 enum {
-  ECHOSPLINE_METHOD_AUTO = 0,        /* pull, or exact where the mesh is finer than the lattice */
+  ECHOSPLINE_METHOD_AUTO = 0,        /* the faster one that is good to 0.1 pixel: pull */
   ECHOSPLINE_METHOD_EXACT = 1,       /* every pixel traced back in the cells of the mesh */
   ECHOSPLINE_METHOD_PULL = 2         /* every fourth pixel and row, interpolated where that is good to 0.1 pixel */
 };

@@ -120,14 +120,10 @@ ECHOSPLINE_INLINE int32_t most(Ints v) {
   for (int i = 1; i < LANES; ++i) s = v[i] > s ? v[i] : s;
   return s;
 }
-/// Write x and y to places of two arrays, lane by lane; of two lanes with the same place the later one counts.
+/// Write x and y to places of two arrays, lane by lane; of two lanes with the same place the later one counts. Single
+/// stores are faster than the scatter instruction.
 ECHOSPLINE_INLINE void scatter(Ints at, Floats x, Floats y, float* to_x, float* to_y) {
-#if defined(__AVX512F__)
-  _mm512_i32scatter_ps(to_x, (__m512i)at, (__m512)x, 4);
-  _mm512_i32scatter_ps(to_y, (__m512i)at, (__m512)y, 4);
-#else
   for (int i = 0; i < LANES; ++i) to_x[at[i]] = x[i], to_y[at[i]] = y[i];
-#endif
 }
 
 ECHOSPLINE_INLINE Floats magnitude(Floats x) { return (Floats)((Ints)x & 0x7fffffff); }

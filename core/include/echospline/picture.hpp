@@ -40,8 +40,7 @@ class Picture {
     m.y0 = float((o_.mesh_origin[1] - o_.origin[1]) / o_.spacing[1]);
     m.hx = float(o_.mesh_spacing[0] / o_.spacing[0]), m.hy = float(o_.mesh_spacing[1] / o_.spacing[1]);
     m.slack = 5e-7f * float(larger(columns_, rows_) + 32);
-    exact_ = o_.method == ECHOSPLINE_METHOD_EXACT ||
-             (o_.method == ECHOSPLINE_METHOD_AUTO && (m.hx < LATTICE || m.hy < LATTICE));
+    exact_ = o_.method == ECHOSPLINE_METHOD_EXACT;
 
     const bool there = ux_.reserve((m.ny + 3) * m.stride) && uy_.reserve((m.ny + 3) * m.stride) &&
                        x_.reserve(rows_ * room_) && y_.reserve(rows_ * room_) &&
