@@ -431,14 +431,15 @@ def contrast(tilt: float, seed: int, tissue: int = 90) -> float:
 @pytest.mark.parametrize(
     ("tilt", "low", "high"),
     [
+        (5, 0.85, 1.05),
         (10, 0.9, 1.1),
         (15, 0.85, 1.05),
-        (20, 0.6, 0.9),
-        (35, 0.15, 0.35),
-        (50, 0.15, 0.35),
-        (60, 0.1, 0.3),
-        (75, 0.05, 0.2),
-        (88, 0.02, 0.16),
+        (20, 0.6, 0.85),
+        (35, 0.21, 0.36),
+        (50, 0.2, 0.34),
+        (60, 0.13, 0.28),
+        (75, 0.08, 0.19),
+        (88, 0.04, 0.15),
     ],
 )
 def test_contrast_against_tilt_is_the_one_measured(tilt, low, high):
