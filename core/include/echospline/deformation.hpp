@@ -187,8 +187,8 @@ ECHOSPLINE_INLINE void trace_row(const Mesh& m, const Cell& c, const Limits& lim
                           (turned_t <= limits.t1) & (at_x != at_x);
       at_x = pick(turned, c.px + turned_s * m.hx, at_x), at_y = pick(turned, c.py + turned_t * m.hy, at_y);
     }
-    store(x + k, pick(in, c.px + s * m.hx, at_x));
-    store(y + k, pick(in, c.py + t * m.hy, at_y));
+    store_whole(x + k, pick(in, c.px + s * m.hx, at_x));
+    store_whole(y + k, pick(in, c.py + t * m.hy, at_y));
   }
 }
 
@@ -214,12 +214,16 @@ ECHOSPLINE_INLINE void trace_row_pairs(const Mesh& m, const Cell& c, const Limit
   }
 }
 
+/// Points that one cell may cover, rows and columns.
+struct Box {
+  int first_row, last_row, first, last;
+};
 template <bool FOLDED>
-inline void trace_cell(const Mesh& m, int i, int j, const Raster& raster, const Boxes& b, int lane, const Marks* marks,
+inline void trace_cell(const Mesh& m, int i, int j, const Raster& raster, const Box& box, const Marks* marks,
                        const Positions& out) {
   const Cell c = cell_at(m, i, j);
   const Limits limits = limits_of(m, i, j);
-  const int first = b.first[lane], last = b.last[lane], first_row = b.first_row[lane], last_row = b.last_row[lane];
+  const auto [first_row, last_row, first, last] = box;
   if (!marks) {
     if constexpr (!FOLDED && LANES >= 8)
       if (last - first < LANES / 2) return trace_row_pairs(m, c, limits, raster, first_row, last_row, first, out);
@@ -291,12 +295,16 @@ inline void trace(const Mesh& m, const Raster& raster, const Marks* marks, const
         trace_cells(m, i, j, c, sound, raster, out);
         if (!any(alone)) continue;
       }
+      int32_t box[6][LANES];  // in memory: lanes are read one by one
+      const Ints parts[6] = {b.first_row, b.last_row, b.first, b.last, b.folded, alone};
+      std::memcpy(box, parts, sizeof box);
       for (int lane = 0; lane < LANES; ++lane) {
-        if (!alone[lane]) continue;
-        if (b.folded[lane])
-          trace_cell<true>(m, i + lane, j, raster, b, lane, marks, out);
+        if (!box[5][lane]) continue;
+        const Box one = {box[0][lane], box[1][lane], box[2][lane], box[3][lane]};
+        if (box[4][lane])
+          trace_cell<true>(m, i + lane, j, raster, one, marks, out);
         else
-          trace_cell<false>(m, i + lane, j, raster, b, lane, marks, out);
+          trace_cell<false>(m, i + lane, j, raster, one, marks, out);
       }
     }
 }
