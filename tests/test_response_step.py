@@ -1,4 +1,4 @@
-"""The fused step against the plain reading of Algorithm 2 that refits at every step."""
+"""The native step against the plain reading of Algorithm 2 that refits at every step."""
 
 from __future__ import annotations
 
@@ -71,16 +71,14 @@ def test_the_fast_step_knows_the_stiffness_of_landmarks(kernel, tip):
 
 
 @pytest.mark.parametrize("grid", [GRID, RegularGrid((81, 61), (0.5, 0.5))], ids=["1.5 mm", "0.5 mm"])
-def test_the_patch_carries_the_tip_at_a_haptic_rate(grid):
+def test_single_precision_is_enough_at_a_haptic_rate(grid):
     slow, fast = TPSModel(grid, solver="refit"), TPSModel(grid)
     a, b = slow.rest(), fast.rest()
     for i in range(400):
         pose = NeedlePose((15.0, 0.0), (15.0 + 0.004 * i, 0.02 * i), 20.4)
         a, b = slow.advance(a, pose, 1e-3), fast.advance(b, pose, 1e-3)
         assert np.abs(slow.displacement(a) - fast.displacement(b)).max() < 1e-5
-    statistics = fast.fast.response.statistics
-    assert statistics.patches > 3
-    assert statistics.direct < 200
+    assert fast.native.statistics.allocations == 0
 
 
 def test_an_old_state_stays_valid_whatever_happened_since():
@@ -100,10 +98,10 @@ def test_a_step_does_not_change_the_state_it_starts_from():
     _, model = pair("single")
     state = model.rest()
     for pose in wandering(8, 1 / 20, 2.0):
-        before = (state.landmarks.copy(), state.tip.copy(), state.mesh.copy())
+        saved, mesh = bytes(state.saved), state.mesh.copy()
         after = model.advance(state, pose, 1 / 20)
-        for old, now in zip(before, (state.landmarks, state.tip, state.mesh), strict=True):
-            assert np.array_equal(old, now)
+        assert state.saved == saved
+        assert np.array_equal(state.mesh, mesh)
         state = after
 
 
@@ -136,7 +134,7 @@ def test_a_node_at_delta_itself_is_touched_as_the_plain_reading_has_it():
         tip = (12.0 + depth * np.cos(np.pi / 3), depth * np.sin(np.pi / 3))
         pose = NeedlePose((12.0, 0.0), tip, 5.0)
         a, b = slow.advance(a, pose, 0.1), fast.advance(b, pose, 0.1)
-        assert np.array_equal(a.contacts, fast.lattice[b.landmarks[:, 0].astype(int)]), depth
+        assert np.array_equal(a.contacts, fast.landmarks(b).contacts), depth
 
 
 class Handling(RuleBasedStateMachine):

@@ -14,11 +14,15 @@ namespace {
 constexpr char STATE_MAGIC[8] = {'e', 'c', 'h', 'o', 's', 't', 'a', 't'};
 constexpr uint32_t STATE_VERSION = 1;
 
-/// Checksum of bytes (Fowler, Noll and Vo, 64 bits), to be continued from another.
+/// Checksum of bytes (Fowler, Noll and Vo, 64 bits, eight bytes at a time), to be continued from another.
 inline uint64_t checksum(const void* bytes, int64_t size, uint64_t sum = 14695981039346656037ull) {
   const unsigned char* p = static_cast<const unsigned char*>(bytes);
-  for (int64_t i = 0; i < size; ++i) sum = (sum ^ p[i]) * 1099511628211ull;
-  return sum;
+  for (int64_t i = 0; i < size; i += 8) {
+    uint64_t word = 0;
+    std::memcpy(&word, p + i, static_cast<size_t>(smaller<int64_t>(8, size - i)));
+    sum = (sum ^ word) * 1099511628211ull;
+  }
+  return sum ^ sum >> 32;  // the highest bits of a word reach only the highest of the product
 }
 
 /// Fixed part of a state's bytes; contacts follow, then the checksum of both.

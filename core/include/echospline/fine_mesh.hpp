@@ -137,7 +137,7 @@ class FineField {
       const double y = first[1] + static_cast<double>(j - 1) * coarse_.stride[1] * step[1];
       const int64_t points = (count - 1) / coarse_.stride[0] + 4;
       for (int64_t i = 0; i < points; i += Lanes<Real>::count) {
-        Vector<Real> offset[D], f[planes];
+        Vector<Real> offset[D] = {}, f[planes];
         for (int l = 0; l < Lanes<Real>::count; ++l)
           offset[0][l] = static_cast<Real>(first[0] + (x0 + static_cast<double>(i + l - 1) * coarse_.stride[0]) * step[0]);
         offset[1] = all<Real>(static_cast<Real>(y));
@@ -155,7 +155,7 @@ class FineField {
                                     interpolated + ((j + 2) * planes + d) * wide_, interpolated + ((j + 3) * planes + d) * wide_};
         along_y(taps_[1][y % coarse_.stride[1]], row, count, sum + d * wide_);
       }
-      Vector<Real> offset[D], f[planes];
+      Vector<Real> offset[D] = {}, f[planes];
       offset[1] = all<Real>(static_cast<Real>(first[1] + static_cast<double>(y) * step[1]));
       for (int64_t x = 0; x < count; x += Lanes<Real>::count) {
         const Real start = static_cast<Real>(first[0] + static_cast<double>(x0 + x) * step[0]);

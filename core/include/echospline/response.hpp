@@ -710,10 +710,10 @@ class Response {
     Landmarks all_landmarks = gather(w, tip, s);
     V change{}, reach{};
     for (int64_t b = 0; b < points_->blocks; ++b) {
-      V x[D][VECTORS], u[D][VECTORS];
-      for (int d = 0; d < D; ++d)
-        for (int v = 0; v < VECTORS; ++v) x[d][v] = load(points_->x[d].data() + b * block + v * Lanes<Real>::count);
-      evaluate(all_landmarks, x, u);
+      Real x[D][block];
+      V u[D][VECTORS];
+      for (int d = 0; d < D; ++d) std::memcpy(x[d], points_->x[d].data() + b * block, sizeof x[d]);
+      evaluate(all_landmarks, x[0], block, u);
       finish_block(b, u, was, mask, out, change, reach);
     }
     return {largest<Real>(change), largest<Real>(reach)};
@@ -743,8 +743,11 @@ class Response {
     for (int64_t j = 0; j < Kernel::motions * D; ++j) motions[j] = static_cast<Real>(gathered_weights_[total * D + j]);
     return {total, gathered_.data(), motions};
   }
-  /// Field of the landmarks at conditioned points, in vectors.
-  ECHOSPLINE_INLINE void evaluate(const Landmarks& all_landmarks, const V (&x)[D][VECTORS], V (&u)[D][VECTORS]) const {
+  /// Field of the landmarks at one block of conditioned points, `stride` numbers from one component to the next.
+  __attribute__((noinline)) void evaluate(const Landmarks& all_landmarks, const Real* points, int64_t stride, V (&u)[D][VECTORS]) const {
+    V x[D][VECTORS];
+    for (int d = 0; d < D; ++d)
+      for (int v = 0; v < VECTORS; ++v) x[d][v] = load(points + d * stride + v * Lanes<Real>::count);
     const Real* a = all_landmarks.motions;
     for (int d = 0; d < D; ++d)
       for (int v = 0; v < VECTORS; ++v) {

@@ -141,10 +141,8 @@ class Tissue {
         const Vec<D> p = scene.anchored.conditioned(place(smaller(first + i, count - 1)));
         for (int d = 0; d < D; ++d) at[d][i] = static_cast<Real>(p[d]);
       }
-      Vector<Real> x[D][VECTORS], u[D][VECTORS];
-      for (int d = 0; d < D; ++d)
-        for (int v = 0; v < VECTORS; ++v) x[d][v] = load(at[d] + v * lanes), u[d][v] = Vector<Real>{};
-      if (!still) response_.evaluate(landmarks, x, u);
+      Vector<Real> u[D][VECTORS] = {};
+      if (!still) response_.evaluate(landmarks, at[0], block, u);
       for (int64_t i = 0; i < smaller(block, count - first); ++i) {
         Vec<D> moved;
         for (int d = 0; d < D; ++d) moved[d] = u[d][i / lanes][i % lanes];

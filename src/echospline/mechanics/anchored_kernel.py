@@ -10,7 +10,6 @@ move. Factored once per scene.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,8 +17,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import lu_factor, lu_solve
 
 from echospline.errors import InputError
-from echospline.mechanics.compiled import add_product
-from echospline.mechanics.kernels import Elastic, Kernel
+from echospline.mechanics.kernels import Kernel
 from echospline.mechanics.spline import Spline, compliance
 from echospline.scene import Floats, as_points
 
@@ -118,29 +116,6 @@ class AnchoredKernel:
         held = np.ascontiguousarray(lu_solve(factors, felt.T, check_finite=False).T)
         return cls(conditioned, B, x, table, factors, y, felt, held, centre, scale)
 
-    @cached_property
-    def form(self) -> Floats:
-        """The kernel as the compiled loops take it: (components, coupling, radius^2)."""
-        if isinstance(self.kernel, Elastic):
-            return np.array([2.0, self.kernel.coupling, self.kernel.radius**2])
-        return np.array([1.0, 0.0, 0.0])
-
-    @cached_property
-    def frame(self) -> Floats:
-        """(centre x, centre y, scale), mm."""
-        return np.array([*self.centre, self.scale])
-
-    @cached_property
-    def columns(self) -> Floats:
-        """The points as (2, n)."""
-        return np.ascontiguousarray(self.points.T)
-
-    @cached_property
-    def L_inverse(self) -> Floats:
-        """L_B^-1: cheaper than its factors for a single point."""
-        inverse: Floats = lu_solve(self.factors, np.eye(len(self.table)), check_finite=False)
-        return np.ascontiguousarray(inverse)
-
     @property
     def components(self) -> int:
         """c, 1 or 2."""
@@ -171,8 +146,8 @@ class AnchoredKernel:
 
     def rows(self, sources: Floats) -> Floats:
         """G at all points for conditioned sources (m, 2), shape (m c, n c): one row per source component."""
-        rows = np.ascontiguousarray(interleaved(self.kernel.matrix(sources, self.points), self.components))
-        add_product(rows, np.ascontiguousarray(-self.coupling(sources).T), self.table)
+        direct = interleaved(self.kernel.matrix(sources, self.points), self.components)
+        rows: Floats = direct - self.coupling(sources).T @ self.table
         return rows
 
     def felt_by(self, sources: Floats) -> Floats:

@@ -167,6 +167,10 @@ class Reference:
         points = np.asarray(points, dtype=np.float64)
         return np.zeros(points.shape) if state.field is None else state.field(points)
 
+    def spline(self, state: TPSState) -> Spline | None:
+        """Return the spline through anchors and the landmarks of a state; None where nothing is displaced."""
+        return self._fit(state.contacts, state.q, state.tip)
+
     def _hold_back(
         self, old: TPSState, new: TPSState, q: Floats, tip: Tip | None, limit: float
     ) -> tuple[TPSState, Tip | None]:

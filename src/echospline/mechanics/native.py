@@ -1,0 +1,306 @@
+"""The step of the spline model by the native core: the same numbers as `mechanics.reference`, fast.
+
+A state is a value: the core's bytes, with the displacement of the mesh. The core keeps a workspace of its own for the last state; going
+on from that one is fast, and from any other one exact after its bytes have been loaded.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import itertools
+import threading
+import weakref
+from collections.abc import Iterable
+from dataclasses import dataclass
+from math import isfinite
+from typing import Any, Literal
+
+import numpy as np
+
+from echospline import _native as core
+from echospline.errors import InputError
+from echospline.mechanics.kernels import Elastic, Kernel
+from echospline.mechanics.landmarks import Clamps
+from echospline.mechanics.parameters import TPSParameters
+from echospline.mechanics.reference import Tip, TPSState
+from echospline.scene import Floats, NeedlePose, RegularGrid
+
+Precision = Literal["single", "double"]
+
+FINE = 20_000
+"""Nodes above which the core evaluates a mesh from a coarse one, and the displacement of a state only when it is asked for."""
+
+_numbers = itertools.count(1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NativeState:
+    """A state of the tissue in the core.
+
+    Parameters
+    ----------
+    number : int
+        Different for every state of the process.
+    saved : bytes
+        The state as the core saves it.
+    mesh : ndarray, shape (n, 2), or None
+        Displacement of the mesh nodes, mm; None for a fine mesh, whose displacement is computed when it is asked for.
+    held_back : int
+        Steps since rest in which the landmarks were slowed down so that the picture does not jump.
+    """
+
+    number: int
+    saved: bytes
+    mesh: Floats | None
+    held_back: int
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Work that the core has done in a model so far.
+
+    Parameters
+    ----------
+    steps : int
+        Steps made.
+    joined, left : int
+        Contacts added and removed.
+    rebuilt : int
+        Times the contacts' inverse was made anew because rounding had grown.
+    allocations : int
+        Made by steps; 0 as long as the reserved room is enough.
+    residual : float
+        Largest misfit at the landmarks seen, mm for displacements of 1 mm.
+    """
+
+    steps: int
+    joined: int
+    left: int
+    rebuilt: int
+    allocations: int
+    residual: float
+
+
+class NativeStep:
+    """Steps of one scene in the core, for any state, from any thread.
+
+    Parameters
+    ----------
+    grid : RegularGrid
+        The mesh.
+    clamps : Clamps
+        The clamped edges and points.
+    parameters : TPSParameters
+        Of the interaction.
+    kernel : Kernel
+        `ThinPlate` or `Elastic`.
+    stiffness : ndarray, shape (n,), or None
+        Per mesh node; None: infinite.
+    precision : {"single", "double"}
+        Of the field.
+
+    Raises
+    ------
+    InputError, SolverError
+        If the core refuses the scene.
+    """
+
+    def __init__(
+        self,
+        grid: RegularGrid,
+        clamps: Clamps,
+        parameters: TPSParameters,
+        kernel: Kernel,
+        stiffness: Floats | None,
+        precision: Precision,
+    ) -> None:
+        self._core = core.library()
+        self._lock = threading.Lock()
+        self._size, self._fine = grid.size, grid.size > FINE
+        options = _options(grid, clamps, parameters, kernel, precision)
+        points = np.ascontiguousarray(clamps.points, dtype=np.float64)
+        options.clamped_points, options.clamped_point_count = points.ctypes.data, len(points)
+        if stiffness is not None:
+            firm = np.ascontiguousarray(stiffness, dtype=np.float64)
+            options.stiffness, options.stiffness_count = firm.ctypes.data, len(firm)
+        self._scene, self._tissue = ctypes.c_void_p(), ctypes.c_void_p()
+        status = self._core.echospline_scene_create(ctypes.byref(options), ctypes.byref(self._scene))
+        weakref.finalize(self, _destroy, self._core, self._scene, self._tissue)
+        core.check(status, self._core.echospline_scene_message, self._scene)
+        self._check(self._core.echospline_tissue_create(self._scene, ctypes.byref(self._tissue)))
+        self._pose = core.Pose()
+        self._at_pose = ctypes.byref(self._pose)
+        self._statistics = core.Statistics(struct_size=ctypes.sizeof(core.Statistics))
+        self._at_statistics = ctypes.byref(self._statistics)
+        self._rest = self._present()
+
+    @property
+    def level(self) -> str:
+        """Name of the processor level in use."""
+        name: bytes = self._core.echospline_level_name(self._core.echospline_scene_level(self._scene))
+        return name.decode()
+
+    @property
+    def statistics(self) -> Statistics:
+        """Work done so far."""
+        with self._lock:
+            self._ask_statistics()
+            s = self._statistics
+            return Statistics(s.steps, s.joined, s.left, s.rebuilt, s.allocations, s.residual)
+
+    def rest(self) -> NativeState:
+        """State of tissue that no needle has touched."""
+        return self._rest
+
+    def advance(self, state: NativeState, pose: NeedlePose, dt: float) -> NativeState:
+        """State after the needle has moved to ``pose`` in ``dt`` seconds, equations (12) to (17)."""
+        with self._lock:
+            self._go_to(state)
+            p = self._pose
+            p.entry[0], p.entry[1] = pose.entry
+            p.tip[0], p.tip[1] = pose.tip
+            p.speed, p.dt = pose.speed, dt
+            status = self._core.echospline_advance(self._tissue, self._at_pose)
+            if status != core.Status.OK:
+                self._current = 0
+                self._check(status)
+            return self._present()
+
+    def displacement(self, state: NativeState) -> Floats:
+        """Displacement of the mesh nodes, shape (n, 2), mm."""
+        if state.mesh is not None:
+            return state.mesh
+        with self._lock:
+            self._go_to(state)
+            return self._mesh()
+
+    def landmarks(self, state: NativeState) -> TPSState:
+        """Return the landmarks of a state as the reference has them (without its pose and field)."""
+        with self._lock:
+            self._go_to(state)
+            count = ctypes.c_int64()
+            self._check(self._core.echospline_landmarks(self._tissue, None, 0, ctypes.byref(count)))
+            marks = (core.Landmark * count.value)()
+            self._check(
+                self._core.echospline_landmarks(self._tissue, marks, count.value, ctypes.byref(count))
+            )
+        contacts = [m for m in marks if m.node >= 0]
+        last = marks[-1] if len(contacts) < len(marks) else None
+        tip = (
+            None
+            if last is None
+            else Tip(
+                np.array(last.place[:2]),
+                np.array(last.displacement[:2]),
+                last.kind == core.LandmarkKind.TIP,
+            )
+        )
+        return TPSState(
+            contacts=np.array([m.node for m in contacts], dtype=np.intp),
+            touching=np.array([m.kind == core.LandmarkKind.CONTACT for m in contacts], dtype=bool),
+            q=np.array([m.displacement[:2] for m in contacts], dtype=np.float64).reshape(-1, 2),
+            along=np.array([m.along for m in contacts], dtype=np.float64),
+            grip=np.array([m.grip[:2] for m in contacts], dtype=np.float64).reshape(-1, 2),
+            tip=tip,
+            held_back=state.held_back,
+        )
+
+    def _go_to(self, state: NativeState) -> None:
+        if state.number != self._current:
+            self._check(self._core.echospline_state_load(self._tissue, state.saved, len(state.saved)))
+            self._current = state.number
+
+    def _present(self) -> NativeState:
+        """State in which the core's tissue is now."""
+        saved = ctypes.create_string_buffer(self._core.echospline_state_size(self._tissue))
+        self._check(self._core.echospline_state_save(self._tissue, saved, len(saved)))
+        self._ask_statistics()
+        self._current = next(_numbers)
+        mesh = None if self._fine else self._mesh()
+        return NativeState(self._current, saved.raw, mesh, self._statistics.held_back)
+
+    def _mesh(self) -> Floats:
+        mesh = np.empty((self._size, 2))
+        self._check(self._core.echospline_displacement(self._tissue, mesh.ctypes.data, mesh.size))
+        return mesh
+
+    def _ask_statistics(self) -> None:
+        self._check(self._core.echospline_tissue_statistics(self._tissue, self._at_statistics))
+
+    def _check(self, status: int) -> None:
+        if status != core.Status.OK:
+            core.check(status, self._core.echospline_tissue_message, self._tissue)
+
+
+def _options(
+    grid: RegularGrid, clamps: Clamps, p: TPSParameters, kernel: Kernel, precision: Precision
+) -> core.SceneOptions:
+    """Options of a scene in the plane."""
+    o = core.SceneOptions(struct_size=ctypes.sizeof(core.SceneOptions), dimension=2)
+    o.precision = core.Precision.SINGLE if precision == "single" else core.Precision.DOUBLE
+    o.tip = core.Tip.TIP_NODE if p.tip == "node" else core.Tip.TIP_POINT
+    o.loading = core.Loading.IMMEDIATE if p.loading == "immediate" else core.Loading.FOLLOW
+    o.clamped = edge_bits(clamps.edges)
+    for d in (0, 1):
+        o.shape[d], o.spacing[d], o.origin[d] = grid.shape[d], grid.spacing[d], grid.origin[d]
+    o.sigma, o.delta, o.alpha1, o.alpha2, o.alpha3 = p.sigma, p.delta, p.alpha1, p.alpha2, p.alpha3
+    o.length, o.drag = p.length, p.drag
+    o.contact_spacing, o.anchor_spacing = p.contact_spacing, p.anchor_spacing
+    elastic = kernel if isinstance(kernel, Elastic) else Elastic()
+    o.kernel = core.Kernel.ELASTIC if elastic is kernel else core.Kernel.THIN_PLATE
+    o.poisson, o.radius = elastic.nu, elastic.radius
+    o.plane = core.Plane.PLANE_STRAIN if elastic.plane == "strain" else core.Plane.PLANE_STRESS
+    return o
+
+
+def edge_bits(edges: Iterable[str]) -> int:
+    """Clamped edges as the core counts them."""
+    return int(sum(core.Edge[edge.upper()] for edge in set(edges)))
+
+
+def _destroy(library: Any, scene: ctypes.c_void_p, tissue: ctypes.c_void_p) -> None:
+    library.echospline_tissue_destroy(tissue)
+    library.echospline_scene_destroy(scene)
+
+
+def follow_command(
+    pose: NeedlePose,
+    entry: tuple[float, float],
+    tip: tuple[float, float],
+    dt: float,
+    lag: float,
+    fastest: float,
+) -> NeedlePose:
+    """Move a needle one step towards where it is commanded, as the core does for every host.
+
+    Parameters
+    ----------
+    pose : NeedlePose
+        Before the step.
+    entry, tip : (x, y)
+        Where the needle shall go, mm.
+    dt : float
+        Length of the step, s, positive.
+    lag : float
+        Time constant with which it follows, s; 0: at once.
+    fastest : float
+        Upper limit of the speed of tip and entry, mm/s.
+
+    Returns
+    -------
+    NeedlePose
+        After the step; its speed is the axial speed of the tip relative to the entry, mm/s.
+    """
+    now, after = core.Pose(entry=(*pose.entry, 0.0), tip=(*pose.tip, 0.0)), core.Pose(dt=dt)
+    command = core.Command((*entry, 0.0), (*tip, 0.0), lag, fastest)
+    status = core.library().echospline_follow(ctypes.byref(now), ctypes.byref(command), ctypes.byref(after))
+    if status != core.Status.OK:
+        raise InputError(
+            "a needle follows finite positions in mm, in steps of a positive dt, with a lag of zero or more and a positive "
+            f"fastest speed; got entry {entry}, tip {tip}, dt {dt} s, lag {lag} s, fastest {fastest} mm/s"
+        )
+    x, y, _ = after.entry
+    u, v, _ = after.tip
+    if not (isfinite(x) and isfinite(u)):
+        raise InputError(f"the needle left every range: command entry {entry}, tip {tip} mm")
+    return NeedlePose((x, y), (u, v), after.speed)
