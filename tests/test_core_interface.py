@@ -215,10 +215,16 @@ def test_javascript_calls_functions_of_the_header_alone():
     names = set(re.findall(r"\b(echospline_\w+)\(", JAVASCRIPT)) - set(header_structs())
     assert names <= set(declared())
     called_by_name = {
-        f"echospline_{what}_{verb}" for what in ("scene", "tissue") for verb in ("create", "message")
+        f"echospline_{what}_{verb}"
+        for what in ("scene", "tissue", "picture")
+        for verb in ("create", "message")
     }
     called_by_name |= {"echospline_scene_destroy", "echospline_tissue_destroy"}
-    not_needed = {"echospline_level_available"}
+    not_needed = {
+        "echospline_level_available",
+        "echospline_picture_deform",
+        "echospline_picture_deform_single",
+    }
     assert set(declared()) - names - called_by_name - not_needed == set()
 
 

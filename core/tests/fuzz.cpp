@@ -56,10 +56,13 @@ class Choices {
 class Session {
  public:
   explicit Session(Choices& choices) : choices_(choices) {}
-  ~Session() { leave(); }
+  ~Session() {
+    leave();
+    echospline_picture_destroy(picture_);
+  }
 
   void act() {
-    switch (choices_.below(20)) {
+    switch (choices_.below(28)) {
       case 0: open(); break;
       case 1: reset(); break;
       case 2:
@@ -273,7 +276,119 @@ class Session {
           false);
   }
 
+  echospline_picture* picture() { return given() ? picture_ : nullptr; }
+  echospline_status drawn(echospline_picture* picture, echospline_status status) {
+    known(status, echospline_picture_message(picture), picture != nullptr);
+    if (!picture) require(status != ECHOSPLINE_OK, "NULL was taken for a picture");
+    return status;
+  }
+
+  void open_picture() {
+    echospline_picture_destroy(picture_);
+    picture_ = nullptr, mesh_nodes_ = 0, pixels_ = 0;
+    echospline_picture_options o;
+    std::memset(&o, 0, sizeof o);
+    o.struct_size = sizeof o;
+    echospline_picture_defaults(&o);
+    if (choices_.rarely()) o.struct_size = choices_.byte();
+    o.pixel_type = choices_.whole(0, 3);
+    o.channels = choices_.below(2) ? choices_.whole(1, 3) : 1;
+    o.interpolation = choices_.whole(0, 1);
+    o.border = choices_.whole(0, 1);
+    o.method = choices_.whole(0, 2);
+    o.level = choices_.below(4) == 0 ? choices_.whole(0, 5) : ECHOSPLINE_LEVEL_BEST;
+    o.columns = choices_.whole(1, 70);
+    o.rows = choices_.whole(1, 70);
+    for (int k = 0; k < 2; ++k) {
+      o.mesh_shape[k] = choices_.whole(2, 12);
+      o.spacing[k] = choices_.number(0.1, 0.5);
+      o.mesh_spacing[k] = choices_.number(0.5, 3);
+      if (choices_.below(4) == 0) o.origin[k] = choices_.number(-5, 5), o.mesh_origin[k] = choices_.number(-5, 5);
+    }
+    if (choices_.below(4) == 0) o.border_value = choices_.number(0, 300);
+    if (choices_.below(4) == 0) o.white = choices_.number(0, 300);
+    const bool small =
+        o.columns > 0 && o.columns < 100 && o.rows > 0 && o.rows < 100 && o.channels > 0 && o.channels < 4;
+    static const int sizes[] = {1, 2, 2, 4};
+    const int64_t bytes = small ? int64_t(o.columns) * o.rows * o.channels * sizes[o.pixel_type & 3] : 0;
+    std::vector<uint8_t> pixels(bytes);
+    for (uint8_t& byte : pixels) byte = choices_.byte();
+    // what is larger than `pixels` must be refused before it is read, so it is not handed over
+    const echospline_status status = echospline_picture_create(
+        given() ? &o : nullptr, given() && bytes ? pixels.data() : nullptr, given() ? &picture_ : nullptr);
+    known(status, echospline_picture_message(picture_), picture_ != nullptr);
+    if (status == ECHOSPLINE_OK)
+      mesh_nodes_ = int64_t(o.mesh_shape[0]) * o.mesh_shape[1], pixels_ = int64_t(o.columns) * o.rows, bytes_ = bytes;
+  }
+
+  void deform() {
+    echospline_picture* p = picture();
+    const int64_t count = choices_.size(2 * mesh_nodes_);
+    std::vector<float> single(2 * mesh_nodes_);
+    for (float& u : single) u = static_cast<float>(choices_.number(-1, 1));
+    const std::vector<double> field(single.begin(), single.end());
+    if (choices_.below(2))
+      drawn(p, echospline_picture_deform(p, given() ? field.data() : nullptr, count));
+    else
+      drawn(p, echospline_picture_deform_single(p, given() ? single.data() : nullptr, count));
+  }
+
+  void draw() {
+    echospline_picture* p = picture();
+    echospline_needle needle;
+    std::memset(&needle, 0, sizeof needle);
+    needle.struct_size = sizeof needle;
+    echospline_needle_defaults(&needle);
+    if (choices_.rarely()) needle.struct_size = choices_.byte();
+    if (choices_.below(4) == 0) needle.parts = choices_.byte() & (choices_.rarely() ? 255 : 15);
+    needle.seed = choices_.byte();
+    needle.curved = choices_.below(4) == 0 ? choices_.whole(0, 1) : 0;
+    for (int k = 0; k < 3; ++k) needle.entry[k] = choices_.number(-2, 12), needle.tip[k] = choices_.number(-2, 12);
+    for (double& x : needle.apex) x = choices_.number(-30, 30);
+    double* numbers[] = {&needle.diameter,        &needle.lateral,        &needle.axial,          &needle.elevation,
+                         &needle.elevation_depth, &needle.element_height, &needle.f_number,       &needle.dynamic_range,
+                         &needle.specular,        &needle.lobe,           &needle.lobe_elevation, &needle.steering,
+                         &needle.roughness,       &needle.rolloff,        &needle.wobble,         &needle.patches,
+                         &needle.bevel,           &needle.ring_down,      &needle.ring_down_loss, &needle.opacity};
+    for (double* number : numbers)
+      if (choices_.rarely()) *number = choices_.number(-10, 40);
+    const echospline_needle* seen = choices_.below(8) ? &needle : nullptr;
+    const int what = choices_.below(6);
+    if (what == 0) {
+      std::vector<float> x(pixels_), y(pixels_);
+      drawn(p, echospline_picture_inverse(p, given() ? x.data() : nullptr, given() ? y.data() : nullptr,
+                                          choices_.size(pixels_)));
+    } else if (what == 1) {
+      echospline_picture_report report;
+      std::memset(&report, 0, sizeof report);
+      report.struct_size = choices_.rarely() ? choices_.byte() % sizeof report : sizeof report;
+      drawn(p, echospline_picture_check(p, given() ? &report : nullptr));
+    } else if (what == 2) {
+      double points[8], power[4], transmission[4];
+      for (double& x : points) x = choices_.number(-5, 20);
+      const int64_t count = choices_.rarely() ? -1 : choices_.below(5);
+      if (drawn(p, echospline_picture_echo(p, seen, given() ? points : nullptr, count, given() ? power : nullptr,
+                                           transmission)) == ECHOSPLINE_OK)
+        for (int64_t i = 0; i < count; ++i)
+          require(std::isfinite(power[i]) && power[i] >= 0 && transmission[i] >= 0 && transmission[i] <= 1.0001,
+                  "an echo that is none");
+    } else if (what == 3) {
+      std::vector<uint8_t> pixels(bytes_, choices_.byte());
+      drawn(p, echospline_picture_reference(p, given() ? pixels.data() : nullptr, choices_.size(bytes_)));
+    } else {
+      const int64_t size = echospline_picture_size(p);
+      require(size >= 0 && size < (1 << 26), "the size of a picture");
+      std::vector<uint8_t> out(size);
+      drawn(p, echospline_picture_draw(p, seen, given() ? out.data() : nullptr, choices_.size(size)));
+    }
+    require(echospline_level_name(echospline_picture_level(p)) != nullptr, "a level without a name");
+  }
+
   void nothing() {
+    echospline_picture_destroy(nullptr);
+    echospline_picture_defaults(nullptr);
+    echospline_needle_defaults(nullptr);
+    echospline_picture_message(nullptr);
     echospline_tissue_destroy(nullptr);
     echospline_scene_destroy(nullptr);
     echospline_scene_defaults(nullptr);
@@ -288,6 +403,8 @@ class Session {
   Choices& choices_;
   echospline_scene* scene_ = nullptr;
   echospline_tissue* tissue_ = nullptr;
+  echospline_picture* picture_ = nullptr;
+  int64_t mesh_nodes_ = 0, pixels_ = 0, bytes_ = 0;
   bool good_ = false;
   int64_t nodes_ = 0;
   int dimension_ = 2;

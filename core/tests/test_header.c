@@ -43,6 +43,21 @@ VALUE(CONTACT, 0);
 VALUE(LEAVING, 1);
 VALUE(TIP, 2);
 VALUE(TIP_LEFT, 3);
+VALUE(UINT8, 0);
+VALUE(UINT16, 1);
+VALUE(INT16, 2);
+VALUE(FLOAT32, 3);
+VALUE(LINEAR, 0);
+VALUE(NEAREST, 1);
+VALUE(BORDER_VALUE, 0);
+VALUE(BORDER_TRANSPARENT, 1);
+VALUE(METHOD_AUTO, 0);
+VALUE(METHOD_EXACT, 1);
+VALUE(METHOD_PULL, 2);
+VALUE(SHAFT, 1);
+VALUE(BEVEL, 2);
+VALUE(TAIL, 4);
+VALUE(SHADOW, 8);
 
 #if UINTPTR_MAX == UINT64_MAX
 #define SIZE(type, size) static_assert(sizeof(type) == size, #type)
@@ -109,6 +124,64 @@ OFFSET(echospline_statistics, rebuilt, 32);
 OFFSET(echospline_statistics, held_back, 40);
 OFFSET(echospline_statistics, allocations, 48);
 OFFSET(echospline_statistics, residual, 56);
+
+SIZE(echospline_picture_options, 128);
+OFFSET(echospline_picture_options, struct_size, 0);
+OFFSET(echospline_picture_options, pixel_type, 4);
+OFFSET(echospline_picture_options, channels, 8);
+OFFSET(echospline_picture_options, interpolation, 12);
+OFFSET(echospline_picture_options, border, 16);
+OFFSET(echospline_picture_options, method, 20);
+OFFSET(echospline_picture_options, level, 24);
+OFFSET(echospline_picture_options, columns, 28);
+OFFSET(echospline_picture_options, rows, 32);
+OFFSET(echospline_picture_options, mesh_shape, 36);
+OFFSET(echospline_picture_options, reserved, 44);
+OFFSET(echospline_picture_options, spacing, 48);
+OFFSET(echospline_picture_options, origin, 64);
+OFFSET(echospline_picture_options, mesh_spacing, 80);
+OFFSET(echospline_picture_options, mesh_origin, 96);
+OFFSET(echospline_picture_options, border_value, 112);
+OFFSET(echospline_picture_options, white, 120);
+
+SIZE(echospline_needle, 240);
+OFFSET(echospline_needle, struct_size, 0);
+OFFSET(echospline_needle, parts, 4);
+OFFSET(echospline_needle, seed, 8);
+OFFSET(echospline_needle, curved, 12);
+OFFSET(echospline_needle, entry, 16);
+OFFSET(echospline_needle, tip, 40);
+OFFSET(echospline_needle, apex, 64);
+OFFSET(echospline_needle, diameter, 80);
+OFFSET(echospline_needle, lateral, 88);
+OFFSET(echospline_needle, axial, 96);
+OFFSET(echospline_needle, elevation, 104);
+OFFSET(echospline_needle, elevation_depth, 112);
+OFFSET(echospline_needle, element_height, 120);
+OFFSET(echospline_needle, f_number, 128);
+OFFSET(echospline_needle, dynamic_range, 136);
+OFFSET(echospline_needle, specular, 144);
+OFFSET(echospline_needle, lobe, 152);
+OFFSET(echospline_needle, lobe_elevation, 160);
+OFFSET(echospline_needle, steering, 168);
+OFFSET(echospline_needle, roughness, 176);
+OFFSET(echospline_needle, rolloff, 184);
+OFFSET(echospline_needle, wobble, 192);
+OFFSET(echospline_needle, patches, 200);
+OFFSET(echospline_needle, bevel, 208);
+OFFSET(echospline_needle, ring_down, 216);
+OFFSET(echospline_needle, ring_down_loss, 224);
+OFFSET(echospline_needle, opacity, 232);
+
+SIZE(echospline_picture_report, 64);
+OFFSET(echospline_picture_report, struct_size, 0);
+OFFSET(echospline_picture_report, method, 4);
+OFFSET(echospline_picture_report, residual, 8);
+OFFSET(echospline_picture_report, difference, 16);
+OFFSET(echospline_picture_report, exact_share, 24);
+OFFSET(echospline_picture_report, folded_cells, 32);
+OFFSET(echospline_picture_report, smallest_jacobian, 40);
+OFFSET(echospline_picture_report, place, 48);
 #endif
 
 int main(void) {

@@ -101,6 +101,28 @@ test("anchors and sources are counted as they are listed", { skip }, () => {
   scene.destroy();
 });
 
+test("a picture is drawn deformed and with a needle", { skip }, () => {
+  const [columns, rows] = [120, 90];
+  const pixels = Uint8Array.from({ length: columns * rows }, (_, i) => 40 + ((i % columns) ^ Math.floor(i / columns)) % 64);
+  const options = { columns, rows, spacing: [0.2, 0.2], mesh_shape: [13, 10], mesh_spacing: [2, 2] };
+  const picture = core.picture(options, pixels);
+  assert.deepEqual(Uint8Array.from(picture.draw(null)), pixels, "undeformed is the reference");
+  const field = Float32Array.from({ length: 2 * 13 * 10 }, (_, i) => (i % 2 ? 0 : 0.4));
+  picture.deform(field);
+  const shifted = Uint8Array.from(picture.draw(null));
+  assert.equal(shifted[45 * columns + 62], pixels[45 * columns + 60], "0.4 mm are two pixels");
+  const { x } = picture.inverse();
+  assert.ok(Math.abs(x[45 * columns + 62] - 60) < 1e-3);
+  const needle = { entry: [5, 0, 0], tip: [17, 12, 0] };
+  assert.notDeepEqual(Uint8Array.from(picture.draw(needle)), shifted);
+  assert.ok(picture.report().residual < 0.1);
+  const { power, transmission } = picture.echo(needle, [11, 6, 11, 9, 21, 9]); // on it, in its shadow, beside both
+  assert.ok(power[0] > power[1] && transmission[1] < 0.5 && transmission[2] > 0.9);
+  assert.throws(() => picture.deform(new Float32Array(3)), /expected 260 numbers/);
+  assert.throws(() => core.picture(options, new Uint8Array(5)), /expected Uint8Array of 10800/);
+  picture.destroy();
+});
+
 test("structs are laid out as the compiler lays them out", { skip: process.env.ECHOSPLINE_WASM_LAYOUTS ? false : "no layouts given" }, () => {
   const given = JSON.parse(readFileSync(process.env.ECHOSPLINE_WASM_LAYOUTS, "utf8"));
   const ours = Object.fromEntries(Object.entries(LAYOUTS).map(([name, { size, fields }]) => [

@@ -50,6 +50,7 @@ public static class Driver
             {
                 Require(error.Status == Status.WrongSize && error.Message.Length > 0, "a wrong size is refused");
             }
+            DrawPicture(field, pose);
             tissue.Reset();
             tissue.Displacement(field);
             foreach (var u in field) Require(u == 0, "rest is rest");
@@ -57,6 +58,33 @@ public static class Driver
                 Core.Name(scene.Level), scene.NodeCount, pose.Tip.X, pose.Tip.Y, largest, Math.Sqrt(at[0] * at[0] + at[1] * at[1]));
         }
         return 0;
+    }
+
+    private static void DrawPicture(float[] field, Pose pose)
+    {
+        var options = PictureOptions.Defaults();
+        options.Columns = 200;
+        options.Rows = 150;
+        options.Spacing = new Point2(0.2, 0.2);
+        options.MeshShape = new Shape2(40, 30);
+        options.MeshSpacing = new Point2(40.0 / 39, 30.0 / 29);
+        var pixels = new byte[options.Columns * options.Rows];
+        for (int i = 0; i < pixels.Length; ++i) pixels[i] = (byte)(i % 200);
+        using (var picture = new Picture(options, pixels))
+        {
+            var still = new byte[picture.Size];
+            var drawn = new byte[picture.Size];
+            picture.Draw(still);
+            picture.Deform(field);
+            var needle = Needle.Defaults();
+            needle.Entry = pose.Entry;
+            needle.Tip = pose.Tip;
+            picture.Draw(ref needle, drawn);
+            int changed = 0;
+            for (int i = 0; i < drawn.Length; ++i) changed += drawn[i] != still[i] ? 1 : 0;
+            Require(changed > drawn.Length / 10, "the picture deforms");
+            Require(picture.Report().Residual < 0.1, "the inverse is good to a tenth of a pixel");
+        }
     }
 
     private static void Require(bool right, string what)

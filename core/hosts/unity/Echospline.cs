@@ -31,6 +31,34 @@ namespace Echospline
 
     public enum LandmarkKind { Contact = 0, Leaving = 1, Tip = 2, TipLeft = 3 }
 
+    public enum PixelType { Uint8 = 0, Uint16 = 1, Int16 = 2, Float32 = 3 }
+
+    public enum Interpolation { Linear = 0, Nearest = 1 }
+
+    public enum Border { BorderValue = 0, BorderTransparent = 1 }
+
+    public enum Method { MethodAuto = 0, MethodExact = 1, MethodPull = 2 }
+
+    [Flags]
+    public enum NeedlePart : uint { Shaft = 1, Bevel = 2, Tail = 4, Shadow = 8 }
+
+    /// <summary>Two numbers in mm: lateral, depth.</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct Point2
+    {
+        public double X, Y;
+
+        public Point2(double x, double y) { X = x; Y = y; }
+    }
+
+    [StructLayout(LayoutKind.Sequential)]
+    public struct Shape2
+    {
+        public int X, Y;
+
+        public Shape2(int x, int y) { X = x; Y = y; }
+    }
+
     /// <summary>Three numbers in mm: lateral, depth, elevation. In the plane the third is not read.</summary>
     [StructLayout(LayoutKind.Sequential)]
     public struct Point
@@ -143,6 +171,92 @@ namespace Echospline
         public long HeldBack;
         public long Allocations;
         public double Residual;
+    }
+
+    /// <summary>echospline_picture_options.</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct PictureOptions
+    {
+        public uint StructSize;
+        public PixelType PixelType;
+        public int Channels;
+        public Interpolation Interpolation;
+        public Border Border;
+        public Method Method;
+        public Level Level;
+        public int Columns;
+        public int Rows;
+        public Shape2 MeshShape;
+        public int Reserved;
+        public Point2 Spacing;
+        public Point2 Origin;
+        public Point2 MeshSpacing;
+        public Point2 MeshOrigin;
+        public double BorderValue;
+        public double White;
+
+        /// <summary>The core's own defaults; sizes and spacings have to be set.</summary>
+        public static PictureOptions Defaults()
+        {
+            var filled = new PictureOptions { StructSize = (uint)Marshal.SizeOf(typeof(PictureOptions)) };
+            Native.echospline_picture_defaults(ref filled);
+            return filled;
+        }
+    }
+
+    /// <summary>echospline_needle.</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct Needle
+    {
+        public uint StructSize;
+        public NeedlePart Parts;
+        public uint Seed;
+        public int Curved;
+        public Point Entry;
+        public Point Tip;
+        public Point2 Apex;
+        public double Diameter;
+        public double Lateral;
+        public double Axial;
+        public double Elevation;
+        public double ElevationDepth;
+        public double ElementHeight;
+        public double FNumber;
+        public double DynamicRange;
+        public double Specular;
+        public double Lobe;
+        public double LobeElevation;
+        public double Steering;
+        public double Roughness;
+        public double Rolloff;
+        public double Wobble;
+        public double Patches;
+        public double Bevel;
+        public double RingDown;
+        public double RingDownLoss;
+        public double Opacity;
+
+        /// <summary>The core's own defaults; entry and tip have to be set.</summary>
+        public static Needle Defaults()
+        {
+            var filled = new Needle { StructSize = (uint)Marshal.SizeOf(typeof(Needle)) };
+            Native.echospline_needle_defaults(ref filled);
+            return filled;
+        }
+    }
+
+    /// <summary>echospline_picture_report.</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct PictureReport
+    {
+        public uint StructSize;
+        public Method Method;
+        public double Residual;
+        public double Difference;
+        public double ExactShare;
+        public long FoldedCells;
+        public double SmallestJacobian;
+        public Point2 Place;
     }
 
     /// <summary>A call of the core that did not succeed, with the core's sentence.</summary>
@@ -278,6 +392,95 @@ namespace Echospline
         }
     }
 
+    /// <summary>A reference image, its deformation and a needle's echo. Pixels are (rows, columns, channels).</summary>
+    public sealed class Picture : IDisposable
+    {
+        private IntPtr handle;
+
+        public Picture(PictureOptions options, Array pixels)
+        {
+            Core.RequireVersion();
+            var pinned = GCHandle.Alloc(pixels, GCHandleType.Pinned);
+            try
+            {
+                var expected = (long)options.Columns * options.Rows * options.Channels;
+                if (pixels.LongLength != expected)
+                    throw new ArgumentException("expected " + expected + " pixels (rows, columns, channels); got " + pixels.LongLength);
+                var status = Native.echospline_picture_create(ref options, pinned.AddrOfPinnedObject(), out handle);
+                if (status == Status.Ok) return;
+                var message = Native.Text(Native.echospline_picture_message(handle));
+                Dispose();
+                throw new EchosplineException(status, message);
+            }
+            finally
+            {
+                pinned.Free();
+            }
+        }
+
+        public Level Level { get { return Native.echospline_picture_level(handle); } }
+
+        /// <summary>Bytes that a drawn picture takes.</summary>
+        public long Size { get { return Native.echospline_picture_size(handle); } }
+
+        /// <summary>Replace the reference by pixels of the same layout.</summary>
+        public void Reference(Array pixels)
+        {
+            var pinned = GCHandle.Alloc(pixels, GCHandleType.Pinned);
+            try { Check(Native.echospline_picture_reference(handle, pinned.AddrOfPinnedObject(), Buffer.ByteLength(pixels))); }
+            finally { pinned.Free(); }
+        }
+
+        /// <summary>Deform by the displacement of the mesh nodes, two numbers each, mm.</summary>
+        public void Deform(double[] field) { Check(Native.echospline_picture_deform(handle, field, field.LongLength)); }
+
+        /// <summary>The same in single precision.</summary>
+        public void Deform(float[] field) { Check(Native.echospline_picture_deform_single(handle, field, field.LongLength)); }
+
+        /// <summary>Draw into bytes, without a needle.</summary>
+        public void Draw(byte[] bytes) { Check(Native.echospline_picture_draw(handle, IntPtr.Zero, bytes, bytes.LongLength)); }
+
+        /// <summary>Draw into bytes, with a needle.</summary>
+        public void Draw(ref Needle needle, byte[] bytes)
+        {
+            Check(Native.echospline_picture_draw(handle, ref needle, bytes, bytes.LongLength));
+        }
+
+        /// <summary>Column and row of the reference that each pixel comes from; NaN where no tissue is.</summary>
+        public void Inverse(float[] x, float[] y)
+        {
+            if (y.Length != x.Length) throw new ArgumentException("expected x and y of one length; got " + x.Length + " and " + y.Length);
+            Check(Native.echospline_picture_inverse(handle, x, y, x.LongLength));
+        }
+
+        /// <summary>Check the inverse against the forward map, and find folds.</summary>
+        public PictureReport Report()
+        {
+            var report = new PictureReport { StructSize = (uint)Marshal.SizeOf(typeof(PictureReport)) };
+            Check(Native.echospline_picture_check(handle, ref report));
+            return report;
+        }
+
+        /// <summary>Echo at points, two numbers each, mm: power relative to white, share of the tissue's power that passes.</summary>
+        public void Echo(ref Needle needle, double[] points, double[] power, double[] transmission)
+        {
+            if (2 * power.Length != points.Length || 2 * transmission.Length != points.Length)
+                throw new ArgumentException("expected room for " + points.Length / 2 + " points; got " + power.Length + " and " + transmission.Length);
+            Check(Native.echospline_picture_echo(handle, ref needle, points, power.LongLength, power, transmission));
+        }
+
+        public void Dispose()
+        {
+            Native.echospline_picture_destroy(handle);
+            handle = IntPtr.Zero;
+        }
+
+        private void Check(Status status)
+        {
+            if (status != Status.Ok) throw new EchosplineException(status, Native.Text(Native.echospline_picture_message(handle)));
+        }
+    }
+
     /// <summary>The library: its version and processor level.</summary>
     public static class Core
     {
@@ -335,5 +538,20 @@ namespace Echospline
         [DllImport(Library)] internal static extern long echospline_state_size(IntPtr tissue);
         [DllImport(Library)] internal static extern Status echospline_state_save(IntPtr tissue, [Out] byte[] bytes, long size);
         [DllImport(Library)] internal static extern Status echospline_state_load(IntPtr tissue, byte[] bytes, long size);
+        [DllImport(Library)] internal static extern void echospline_picture_defaults(ref PictureOptions options);
+        [DllImport(Library)] internal static extern void echospline_needle_defaults(ref Needle needle);
+        [DllImport(Library)] internal static extern Status echospline_picture_create(ref PictureOptions options, IntPtr pixels, out IntPtr picture);
+        [DllImport(Library)] internal static extern void echospline_picture_destroy(IntPtr picture);
+        [DllImport(Library)] internal static extern IntPtr echospline_picture_message(IntPtr picture);
+        [DllImport(Library)] internal static extern Level echospline_picture_level(IntPtr picture);
+        [DllImport(Library)] internal static extern long echospline_picture_size(IntPtr picture);
+        [DllImport(Library)] internal static extern Status echospline_picture_reference(IntPtr picture, IntPtr pixels, long bytes);
+        [DllImport(Library)] internal static extern Status echospline_picture_deform(IntPtr picture, double[] displacement, long count);
+        [DllImport(Library)] internal static extern Status echospline_picture_deform_single(IntPtr picture, float[] displacement, long count);
+        [DllImport(Library)] internal static extern Status echospline_picture_draw(IntPtr picture, IntPtr needle, [Out] byte[] bytes, long size);
+        [DllImport(Library)] internal static extern Status echospline_picture_draw(IntPtr picture, ref Needle needle, [Out] byte[] bytes, long size);
+        [DllImport(Library)] internal static extern Status echospline_picture_inverse(IntPtr picture, [Out] float[] x, [Out] float[] y, long count);
+        [DllImport(Library)] internal static extern Status echospline_picture_check(IntPtr picture, ref PictureReport report);
+        [DllImport(Library)] internal static extern Status echospline_picture_echo(IntPtr picture, ref Needle needle, double[] points, long point_count, [Out] double[] power, [Out] double[] transmission);
     }
 }

@@ -23,7 +23,7 @@ constexpr int MOST_TAPS = 480;        // half width of the smoothing, entries
 constexpr int PROFILE_COUNT = 8192;   // most entries of P
 constexpr int KNOTS = 33;             // places on the needle at which angles are evaluated
 constexpr int TAIL_COUNT = 256;       // entries along the ring-down
-constexpr float REACH = 4.2f;         // sigmas at which exp(-q) is 77 dB down: weaker echoes are not drawn
+constexpr float ECHO_REACH = 4.2f;         // sigmas at which exp(-q) is 77 dB down: weaker echoes are not drawn
 constexpr float TAIL_END = -55.0f;    // dB at which the ring-down ends, below the tissue: each millimetre costs time
 constexpr float COMB = 0.34f;         // mm between rungs of the tail: 0.27 diameters, 18 gauge with its stylet
 constexpr float BEVEL_LENGTH = 1.8f;  // diameters
@@ -173,7 +173,7 @@ class NeedleEcho {
     double wall[2];
     near_wall(spot_[1][0], spot_[1][1], wall);
     spot_[1][0] += float(wall[0]), spot_[1][1] += float(wall[1]);
-    spot_reach_ = REACH * larger(needle.lateral, needle.axial);
+    spot_reach_ = ECHO_REACH * larger(needle.lateral, needle.axial);
     tabulate(needle, extent, noise);
   }
 
@@ -265,7 +265,7 @@ class NeedleEcho {
     const Floats per = 1.0f / uqu, s = (ql_ * rl * v.ul + qa_ * ra * v.ua + qe * rz * uz_) * per;
     const Floats la = rl * v.ua - ra * v.ul, lz = rl * uz_ - rz * v.ul, az = ra * uz_ - rz * v.ua;
     const Floats q = (ql_ * qa_ * la * la + qe * (ql_ * lz * lz + qa_ * az * az)) * per;  // rQr - (rQu)^2 / uQu
-    if ((parts_ & ECHOSPLINE_SHAFT) && any(q < REACH * REACH)) power += exp_minus(q) * along(tables_.profile.data(), s);
+    if ((parts_ & ECHOSPLINE_SHAFT) && any(q < ECHO_REACH * ECHO_REACH)) power += exp_minus(q) * along(tables_.profile.data(), s);
     if (rings_) {
       // the line shifted down the beam by the t that brings it nearest to the pixel
       const Floats a = qa_ * (along_l + along_z) * per, b = qa_ * (ra - s * v.ua);
@@ -372,7 +372,7 @@ class NeedleEcho {
     first = -pad, last = length_ + pad;
     const double deepest = larger(slice_at(extent.top), slice_at(extent.bottom));
     const double reach =
-        (REACH + 0.3) * (curved_ ? larger(deepest, slice_at(extent.bottom - extent.top)) : deepest) + radius_;
+        (ECHO_REACH + 0.3) * (curved_ ? larger(deepest, slice_at(extent.bottom - extent.top)) : deepest) + radius_;
     const double low[3] = {extent.left - margin, extent.top - margin, -reach},
                  high[3] = {extent.right + margin, extent.bottom + margin, reach};
     for (int k = 0; k < 3; ++k) {
@@ -393,7 +393,7 @@ class NeedleEcho {
     const double longest_tail =
         (parts_ & ECHOSPLINE_TAIL) ? larger(0.0, (n.specular + n.ring_down - TAIL_END) / n.ring_down_loss) : 0.0;
     double first, last;
-    if (!visible(extent, REACH * widest + n.diameter + longest_tail, pad, first, last)) return;
+    if (!visible(extent, ECHO_REACH * widest + n.diameter + longest_tail, pad, first, last)) return;
 
     Knot knots[KNOTS + 1];
     const double gap = (last - first) / (KNOTS - 1);
@@ -411,7 +411,7 @@ class NeedleEcho {
     double finest = 1e9;
     for (int k = 0; k < KNOTS; ++k) finest = smaller(finest, double(knots[k].sigma));
     footprint_.radius =
-        REACH * smaller(widest, n.lateral * n.axial / (finest * larger(flat, 1e-6))) + (curved_ ? 0.2 * radius_ : 0.0);
+        ECHO_REACH * smaller(widest, n.lateral * n.axial / (finest * larger(flat, 1e-6))) + (curved_ ? 0.2 * radius_ : 0.0);
     for (int side = 0; side < 2; ++side) {
       const double s = side ? last : first;
       double x = entry_[0] + s * u_[0], y = entry_[1] + s * u_[1], wall[2];

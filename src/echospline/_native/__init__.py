@@ -101,6 +101,46 @@ class LandmarkKind(IntEnum):
     TIP_LEFT = 3
 
 
+class PixelType(IntEnum):
+    """Type of a picture's pixels."""
+
+    UINT8 = 0
+    UINT16 = 1
+    INT16 = 2
+    FLOAT32 = 3
+
+
+class Interpolation(IntEnum):
+    """How a picture reads its reference between pixels."""
+
+    LINEAR = 0
+    NEAREST = 1
+
+
+class Border(IntEnum):
+    """What is drawn where no tissue is."""
+
+    BORDER_VALUE = 0
+    BORDER_TRANSPARENT = 1
+
+
+class Method(IntEnum):
+    """How a picture finds where pixels come from."""
+
+    METHOD_AUTO = 0
+    METHOD_EXACT = 1
+    METHOD_PULL = 2
+
+
+class NeedlePart(IntFlag):
+    """Parts of a needle's echo."""
+
+    SHAFT = 1
+    BEVEL = 2
+    TAIL = 4
+    SHADOW = 8
+
+
 class SceneOptions(ctypes.Structure):
     """echospline_scene_options."""
 
@@ -178,6 +218,79 @@ class Statistics(ctypes.Structure):
     ]
 
 
+class PictureOptions(ctypes.Structure):
+    """echospline_picture_options."""
+
+    _fields_ = [
+        ("struct_size", c_uint32),
+        ("pixel_type", c_int32),
+        ("channels", c_int32),
+        ("interpolation", c_int32),
+        ("border", c_int32),
+        ("method", c_int32),
+        ("level", c_int32),
+        ("columns", c_int32),
+        ("rows", c_int32),
+        ("mesh_shape", c_int32 * 2),
+        ("reserved", c_int32),
+        ("spacing", c_double * 2),
+        ("origin", c_double * 2),
+        ("mesh_spacing", c_double * 2),
+        ("mesh_origin", c_double * 2),
+        ("border_value", c_double),
+        ("white", c_double),
+    ]
+
+
+class Needle(ctypes.Structure):
+    """echospline_needle."""
+
+    _fields_ = [
+        ("struct_size", c_uint32),
+        ("parts", c_uint32),
+        ("seed", c_uint32),
+        ("curved", c_int32),
+        ("entry", c_double * 3),
+        ("tip", c_double * 3),
+        ("apex", c_double * 2),
+        ("diameter", c_double),
+        ("lateral", c_double),
+        ("axial", c_double),
+        ("elevation", c_double),
+        ("elevation_depth", c_double),
+        ("element_height", c_double),
+        ("f_number", c_double),
+        ("dynamic_range", c_double),
+        ("specular", c_double),
+        ("lobe", c_double),
+        ("lobe_elevation", c_double),
+        ("steering", c_double),
+        ("roughness", c_double),
+        ("rolloff", c_double),
+        ("wobble", c_double),
+        ("patches", c_double),
+        ("bevel", c_double),
+        ("ring_down", c_double),
+        ("ring_down_loss", c_double),
+        ("opacity", c_double),
+    ]
+
+
+class PictureReport(ctypes.Structure):
+    """echospline_picture_report."""
+
+    _fields_ = [
+        ("struct_size", c_uint32),
+        ("method", c_int32),
+        ("residual", c_double),
+        ("difference", c_double),
+        ("exact_share", c_double),
+        ("folded_cells", c_int64),
+        ("smallest_jacobian", c_double),
+        ("place", c_double * 2),
+    ]
+
+
 FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {  # name: result, arguments; handles and arrays are addresses
     "echospline_status_text": (c_char_p, [c_int32]),
     "echospline_version": (c_uint32, []),
@@ -208,6 +321,20 @@ FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {  # name: result, arguments; hand
     "echospline_state_size": (c_int64, [c_void_p]),
     "echospline_state_save": (c_int32, [c_void_p, c_void_p, c_int64]),
     "echospline_state_load": (c_int32, [c_void_p, c_void_p, c_int64]),
+    "echospline_picture_defaults": (None, [POINTER(PictureOptions)]),
+    "echospline_needle_defaults": (None, [POINTER(Needle)]),
+    "echospline_picture_create": (c_int32, [POINTER(PictureOptions), c_void_p, POINTER(c_void_p)]),
+    "echospline_picture_destroy": (None, [c_void_p]),
+    "echospline_picture_message": (c_char_p, [c_void_p]),
+    "echospline_picture_level": (c_int32, [c_void_p]),
+    "echospline_picture_size": (c_int64, [c_void_p]),
+    "echospline_picture_reference": (c_int32, [c_void_p, c_void_p, c_int64]),
+    "echospline_picture_deform": (c_int32, [c_void_p, c_void_p, c_int64]),
+    "echospline_picture_deform_single": (c_int32, [c_void_p, c_void_p, c_int64]),
+    "echospline_picture_draw": (c_int32, [c_void_p, POINTER(Needle), c_void_p, c_int64]),
+    "echospline_picture_inverse": (c_int32, [c_void_p, c_void_p, c_void_p, c_int64]),
+    "echospline_picture_check": (c_int32, [c_void_p, POINTER(PictureReport)]),
+    "echospline_picture_echo": (c_int32, [c_void_p, POINTER(Needle), c_void_p, c_int64, c_void_p, c_void_p]),
 }
 
 

@@ -1,4 +1,4 @@
-// The core in WebAssembly: scenes, tissues and the motion of a needle, over the C interface and nothing else.
+// The core in WebAssembly: scenes, tissues, pictures and the motion of a needle, over the C interface and nothing else.
 //
 // `load(bytes)` makes a Core from the bytes of echospline.wasm, in a page, a worker or node. Structs and enums have the names of
 // core/include/echospline/echospline.h; there are no defaults here. Handles live in the module's memory: `destroy` them, tissues first.
@@ -20,6 +20,11 @@ export const Tip = Object.freeze({ TIP_POINT: 0, TIP_NODE: 1 });
 export const Loading = Object.freeze({ FOLLOW: 0, IMMEDIATE: 1 });
 export const Plane = Object.freeze({ PLANE_STRESS: 0, PLANE_STRAIN: 1 });
 export const Edge = Object.freeze({ LEFT: 1, RIGHT: 2, TOP: 4, BOTTOM: 8, FRONT: 16, BACK: 32 });
+export const PixelType = Object.freeze({ UINT8: 0, UINT16: 1, INT16: 2, FLOAT32: 3 });
+export const Interpolation = Object.freeze({ LINEAR: 0, NEAREST: 1 });
+export const Border = Object.freeze({ BORDER_VALUE: 0, BORDER_TRANSPARENT: 1 });
+export const Method = Object.freeze({ METHOD_AUTO: 0, METHOD_EXACT: 1, METHOD_PULL: 2 });
+export const NeedlePart = Object.freeze({ SHAFT: 1, BEVEL: 2, TAIL: 4, SHADOW: 8 });
 export const LandmarkKind = Object.freeze({ CONTACT: 0, LEAVING: 1, TIP: 2, TIP_LEFT: 3 });
 
 /** @typedef {"i32" | "u32" | "i64" | "f64" | "pointer"} Kind */
@@ -37,6 +42,22 @@ export const LandmarkKind = Object.freeze({ CONTACT: 0, LEAVING: 1, TIP: 2, TIP_
  *   stiffness?: Numbers, contact_room?: number
  * }} SceneOptions
  */
+/**
+ * Options of a picture, named as in echospline_picture_options.
+ * @typedef {{
+ *   pixel_type?: number, channels?: number, interpolation?: number, border?: number, method?: number, level?: number,
+ *   columns?: number, rows?: number, mesh_shape?: Numbers, spacing?: Numbers, origin?: Numbers, mesh_spacing?: Numbers,
+ *   mesh_origin?: Numbers, border_value?: number, white?: number
+ * }} PictureOptions
+ */
+/** A needle, named as in echospline_needle. @typedef {Record<string, number | Numbers>} Needle */
+/**
+ * @typedef {{
+ *   method: number, residual: number, difference: number, exact_share: number, folded_cells: number,
+ *   smallest_jacobian: number, place: number[]
+ * }} PictureReport
+ */
+/** @typedef {Uint8Array | Uint16Array | Int16Array | Float32Array} Pixels */
 /** @typedef {{ entry: Numbers, tip: Numbers, speed: number, dt: number }} Pose */
 /** @typedef {{ entry: Numbers, tip: Numbers, lag: number, fastest: number }} Command */
 /**
@@ -90,6 +111,24 @@ export const LAYOUTS = Object.freeze({
     ["struct_size", "u32"], ["reserved", "i32"], ["steps", "i64"], ["joined", "i64"], ["left", "i64"],
     ["rebuilt", "i64"], ["held_back", "i64"], ["allocations", "i64"], ["residual", "f64"],
   ]),
+  echospline_picture_options: layout([
+    ["struct_size", "u32"], ["pixel_type", "i32"], ["channels", "i32"], ["interpolation", "i32"], ["border", "i32"],
+    ["method", "i32"], ["level", "i32"], ["columns", "i32"], ["rows", "i32"], ["mesh_shape", "i32", 2],
+    ["reserved", "i32"], ["spacing", "f64", 2], ["origin", "f64", 2], ["mesh_spacing", "f64", 2],
+    ["mesh_origin", "f64", 2], ["border_value", "f64"], ["white", "f64"],
+  ]),
+  echospline_needle: layout([
+    ["struct_size", "u32"], ["parts", "u32"], ["seed", "u32"], ["curved", "i32"], ["entry", "f64", 3],
+    ["tip", "f64", 3], ["apex", "f64", 2], ["diameter", "f64"], ["lateral", "f64"], ["axial", "f64"],
+    ["elevation", "f64"], ["elevation_depth", "f64"], ["element_height", "f64"], ["f_number", "f64"],
+    ["dynamic_range", "f64"], ["specular", "f64"], ["lobe", "f64"], ["lobe_elevation", "f64"], ["steering", "f64"],
+    ["roughness", "f64"], ["rolloff", "f64"], ["wobble", "f64"], ["patches", "f64"], ["bevel", "f64"],
+    ["ring_down", "f64"], ["ring_down_loss", "f64"], ["opacity", "f64"],
+  ]),
+  echospline_picture_report: layout([
+    ["struct_size", "u32"], ["method", "i32"], ["residual", "f64"], ["difference", "f64"], ["exact_share", "f64"],
+    ["folded_cells", "i64"], ["smallest_jacobian", "f64"], ["place", "f64", 2],
+  ]),
 });
 
 /** A call of the core that did not succeed; `status` is one of Status. */
@@ -139,6 +178,11 @@ export class Core {
   /** Factor a scene. @param {SceneOptions} options @returns {Scene} */
   scene(options) {
     return new Scene(this, options);
+  }
+
+  /** Make a picture of undeformed tissue. @param {PictureOptions} options @param {Pixels} pixels @returns {Picture} */
+  picture(options, pixels) {
+    return new Picture(this, options, pixels);
   }
 
   /**
@@ -220,12 +264,12 @@ export class Core {
     throw new CoreError(status, this.text(this.functions[`echospline_${what}_message`](handle)));
   }
 
-  /** Call a create function and return its handle. @param {string} what @param {number} from @returns {number} */
-  create(what, from) {
+  /** Call a create function and return its handle. @param {string} what @param {number[]} from @returns {number} */
+  create(what, ...from) {
     const at = this.allocate(4);
     try {
       new Uint32Array(this.buffer, at, 1)[0] = 0;
-      const status = this.functions[`echospline_${what}_create`](from, at);
+      const status = this.functions[`echospline_${what}_create`](...from, at);
       const handle = new Uint32Array(this.buffer, at, 1)[0];
       if (status !== Status.OK) {
         const message = this.text(this.functions[`echospline_${what}_message`](handle));
@@ -429,4 +473,147 @@ export class Tissue {
     functions.free(this.field);
     this.handle = this.pose = this.field = 0;
   }
+}
+
+/** A reference image, its deformation and a needle's echo. */
+export class Picture {
+  /** @param {Core} core @param {PictureOptions} options @param {Pixels} pixels */
+  constructor(core, options, pixels) {
+    this.core = core;
+    const shape = LAYOUTS.echospline_picture_options;
+    const at = core.allocate(shape.size);
+    const image = core.allocate(pixels.byteLength);
+    try {
+      core.write(at, shape, { struct_size: shape.size });
+      core.functions.echospline_picture_defaults(at);
+      core.write(at, shape, options);
+      const { columns, rows, channels, pixel_type, mesh_shape } = /** @type {any} */ (core.read(at, shape));
+      /** @type {number} */
+      this.pixels = columns * rows;
+      const type = [Uint8Array, Uint16Array, Int16Array, Float32Array][pixel_type];
+      const expected = this.pixels * channels;
+      if (type === undefined || !(pixels instanceof type) || pixels.length !== expected) {
+        const came = `${pixels.constructor.name} of ${pixels.length}`;
+        throw new CoreError(Status.WRONG_SIZE, `expected ${type?.name} of ${expected} (rows, columns, channels); got ${came}`);
+      }
+      this.type = type;
+      new Uint8Array(core.buffer, image, pixels.byteLength).set(bytesOf(pixels));
+      this.handle = core.create("picture", at, image);
+      /** @type {number} */
+      this.numbers = 2 * mesh_shape[0] * mesh_shape[1];
+    } finally {
+      core.functions.free(at);
+      core.functions.free(image);
+    }
+    this.size = Number(core.functions.echospline_picture_size(this.handle));
+    this.level = core.text(core.functions.echospline_level_name(core.functions.echospline_picture_level(this.handle)));
+    this.out = core.allocate(this.size);
+    this.field = core.allocate(8 * this.numbers);
+    this.needle = core.allocate(LAYOUTS.echospline_needle.size);
+  }
+
+  /** Throw unless a call succeeded. @param {number} status */
+  check(status) {
+    this.core.check(status, "picture", this.handle);
+  }
+
+  /** Replace the reference by pixels of the same layout. @param {Pixels} pixels */
+  reference(pixels) {
+    const at = this.core.allocate(pixels.byteLength);
+    try {
+      new Uint8Array(this.core.buffer, at, pixels.byteLength).set(bytesOf(pixels));
+      this.check(this.core.functions.echospline_picture_reference(this.handle, at, BigInt(pixels.byteLength)));
+    } finally {
+      this.core.functions.free(at);
+    }
+  }
+
+  /** Deform by the displacement of the mesh nodes, two numbers each, mm. @param {Float64Array | Float32Array} displacement */
+  deform(displacement) {
+    const { functions } = this.core;
+    if (displacement.length !== this.numbers) {
+      throw new CoreError(Status.WRONG_SIZE, `expected ${this.numbers} numbers of displacement; got ${displacement.length}`);
+    }
+    const single = displacement instanceof Float32Array;
+    new (single ? Float32Array : Float64Array)(this.core.buffer, this.field, this.numbers).set(displacement);
+    const deform = single ? functions.echospline_picture_deform_single : functions.echospline_picture_deform;
+    this.check(deform(this.handle, this.field, BigInt(this.numbers)));
+  }
+
+  /** Draw the picture: a view. @param {Needle | null} needle @returns {Pixels} */
+  draw(needle) {
+    const at = needle === null ? 0 : this.placeNeedle(needle);
+    this.check(this.core.functions.echospline_picture_draw(this.handle, at, this.out, BigInt(this.size)));
+    return new this.type(this.core.buffer, this.out, this.size / this.type.BYTES_PER_ELEMENT);
+  }
+
+  /** Column and row of the reference that each pixel comes from; NaN where no tissue is. @returns {{ x: Float32Array, y: Float32Array }} */
+  inverse() {
+    const { functions } = this.core;
+    const at = this.core.allocate(8 * this.pixels);
+    try {
+      const y = at + 4 * this.pixels;
+      this.check(functions.echospline_picture_inverse(this.handle, at, y, BigInt(this.pixels)));
+      const { buffer } = this.core;
+      return { x: new Float32Array(buffer, at, this.pixels).slice(), y: new Float32Array(buffer, y, this.pixels).slice() };
+    } finally {
+      functions.free(at);
+    }
+  }
+
+  /** Check the inverse against the forward map, and find folds. @returns {PictureReport} */
+  report() {
+    const shape = LAYOUTS.echospline_picture_report;
+    const at = this.core.allocate(shape.size);
+    try {
+      this.core.write(at, shape, { struct_size: shape.size });
+      this.check(this.core.functions.echospline_picture_check(this.handle, at));
+      return /** @type {any} */ (this.core.read(at, shape));
+    } finally {
+      this.core.functions.free(at);
+    }
+  }
+
+  /**
+   * Echo at points of the plane, two numbers each, mm: power relative to white, and share of the tissue's power that passes.
+   * @param {Needle} needle @param {Numbers} points @returns {{ power: Float64Array, transmission: Float64Array }}
+   */
+  echo(needle, points) {
+    const { functions } = this.core;
+    const count = points.length / 2;
+    const given = this.core.place(points);
+    const result = this.core.allocate(16 * count);
+    try {
+      const status = functions.echospline_picture_echo(
+        this.handle, this.placeNeedle(needle), given, BigInt(count), result, result + 8 * count);
+      this.check(status);
+      const { buffer } = this.core;
+      const [power, transmission] = [result, result + 8 * count].map((at) => new Float64Array(buffer, at, count).slice());
+      return { power, transmission };
+    } finally {
+      functions.free(given);
+      functions.free(result);
+    }
+  }
+
+  /** Address of a needle: the core's default one with what is given. @param {Needle} needle @returns {number} */
+  placeNeedle(needle) {
+    const shape = LAYOUTS.echospline_needle;
+    this.core.write(this.needle, shape, { struct_size: shape.size });
+    this.core.functions.echospline_needle_defaults(this.needle);
+    this.core.write(this.needle, shape, needle);
+    return this.needle;
+  }
+
+  destroy() {
+    const { functions } = this.core;
+    functions.echospline_picture_destroy(this.handle);
+    for (const at of [this.out, this.field, this.needle]) functions.free(at);
+    this.handle = this.out = this.field = this.needle = 0;
+  }
+}
+
+/** Bytes under a typed array. @param {Pixels} pixels @returns {Uint8Array} */
+function bytesOf(pixels) {
+  return new Uint8Array(pixels.buffer, pixels.byteOffset, pixels.byteLength);
 }
