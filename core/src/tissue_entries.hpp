@@ -17,6 +17,8 @@ struct TissueFunctions {
   echospline_status (*displacement)(void* tissue, double* out);
   echospline_status (*displacement_single)(void* tissue, float* out);
   echospline_status (*displacement_at)(void* tissue, const double* points, int64_t count, double* out);
+  /// Displacement of a plane mesh in planes of single precision, valid until the next step; nullptr where the field has none.
+  echospline_status (*planes)(void* tissue, const float** x, const float** y);
   int64_t (*landmarks)(void* tissue, echospline_landmark* out, int64_t room);
   void (*statistics)(void* tissue, echospline_statistics& out);
   int64_t (*state_size)(const void* tissue);
