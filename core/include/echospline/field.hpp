@@ -14,9 +14,10 @@
 
 namespace echospline::ECHOSPLINE_CORE {
 
-constexpr double CAREFUL = 35;  // weight times sum of anchors' shares beyond which a tip's column is computed in double, as its last digits
-                                // would be more than some 1e-6 mm of the field
-constexpr int VECTORS = 4;      // registers whose sums one pass over the landmarks fills
+constexpr double CAREFUL =
+    35;  // weight times sum of anchors' shares beyond which a tip's column is computed in double, as its last digits
+         // would be more than some 1e-6 mm of the field
+constexpr int VECTORS = 4;  // registers whose sums one pass over the landmarks fills
 
 /// Points at which the field is wanted, as vectors read them: blocks of VECTORS registers, the last one filled up with the last point.
 template <int D, class Real>
@@ -72,9 +73,9 @@ class FieldScene : public SceneField<D> {
   const Scene<D>& scene;
   Kernel kernel;
   Points<D, Real> points;
-  Array<int64_t> at;    ///< which of the points every source is
-  Array<Real> mask;     ///< 1 at sources, else 0
-  Array<Real> table;    ///< in the plane: (blocks, order, c, block)
+  Array<int64_t> at;     ///< which of the points every source is
+  Array<Real> mask;      ///< 1 at sources, else 0
+  Array<Real> table;     ///< in the plane: (blocks, order, c, block)
   CoarseGrid<D> coarse;  ///< of a fine plane mesh
 
   explicit FieldScene(const Scene<D>& given)
@@ -161,13 +162,14 @@ class FieldOf : public SessionField<D> {
     Array<double> places, landmark_weights;
     const int64_t most = anchored_.anchors + contacts + 1 + Kernel::motions;
     if (!columns.reserve(keeps_columns ? points_.blocks * (contacts + 1) * c * planes_of * block : 0) ||
-        !weights.reserve(((contacts + 1) * c + anchored_.order) * D) || !gathered.reserve(most * 2 * D) || !places.reserve(most * D) ||
-        !landmark_weights.reserve(most * D))
+        !weights.reserve(((contacts + 1) * c + anchored_.order) * D) || !gathered.reserve(most * 2 * D) ||
+        !places.reserve(most * D) || !landmark_weights.reserve(most * D))
       return false;
     for (int64_t b = 0; keeps_columns && b < points_.blocks && kept; ++b)
       std::memcpy(&columns[b * (contacts + 1) * c * planes_of * block], column(b, 0),
                   static_cast<size_t>(kept * c * planes_of * block) * sizeof(Real));
-    columns_.swap(columns), weights_.swap(weights), gathered_.swap(gathered), places_.swap(places), landmark_weights_.swap(landmark_weights);
+    columns_.swap(columns), weights_.swap(weights), gathered_.swap(gathered), places_.swap(places),
+        landmark_weights_.swap(landmark_weights);
     room_ = contacts;
     return true;
   }
@@ -178,7 +180,8 @@ class FieldOf : public SessionField<D> {
     for (int64_t b = 0; keeps_columns && b < points_.blocks; ++b) {
       Real* child = column(b, to);
       const Real* own = column(b, from);
-      for (int64_t i = 0; i < c * planes_of * block; i += Lanes<Real>::count) store(child + i, load(child + i) + load(own + i));
+      for (int64_t i = 0; i < c * planes_of * block; i += Lanes<Real>::count)
+        store(child + i, load(child + i) + load(own + i));
     }
   }
   void move(int64_t from, int64_t to) override {
@@ -243,15 +246,20 @@ class FieldOf : public SessionField<D> {
   struct NoFineField {};
   [[no_unique_address]] std::conditional_t<D == 2, FineField<Kernel, Real>, NoFineField> fine_;
 
-  Real* column(int64_t block_index, int64_t slot) { return columns_.data() + (block_index * (room_ + 1) + slot) * c * planes_of * block; }
-  const Real* table(int64_t block_index) const { return given_.table.data() + block_index * anchored_.order * c * block; }
+  Real* column(int64_t block_index, int64_t slot) {
+    return columns_.data() + (block_index * (room_ + 1) + slot) * c * planes_of * block;
+  }
+  const Real* table(int64_t block_index) const {
+    return given_.table.data() + block_index * anchored_.order * c * block;
+  }
 
   /// Mesh displacement in planes: the field itself, or the fine one from it.
-  const Planes<D, Real>& mesh_planes(const LandmarkWeights<D>& landmarks) {
+  __attribute__((noinline)) const Planes<D, Real>& mesh_planes(const LandmarkWeights<D>& landmarks) {
     if (!given_.scene.fine()) return now_;
     fine_.compute(now_.u[0].data(), now_.u[1].data());
     const Real* p = gather(landmarks);
-    for (int64_t i = 0; i < landmarks.count; ++i, p += 2 * D) fine_.correct(p, p + D, given_.kernel, anchored_.centre, anchored_.scale);
+    for (int64_t i = 0; i < landmarks.count; ++i, p += 2 * D)
+      fine_.correct(p, p + D, given_.kernel, anchored_.centre, anchored_.scale);
     return fine_.field;
   }
   template <class Number>
@@ -269,7 +277,8 @@ class FieldOf : public SessionField<D> {
   }
 
   /// Store one block of a field and keep the largest squares at sources.
-  ECHOSPLINE_INLINE void finish_block(int64_t b, const V (&u)[D][VECTORS], Planes<D, Real>& out, V& change, V& reach) const {
+  ECHOSPLINE_INLINE void finish_block(int64_t b, const V (&u)[D][VECTORS], Planes<D, Real>& out, V& change,
+                                      V& reach) const {
     for (int v = 0; v < VECTORS; ++v) {
       const int64_t at = b * block + v * Lanes<Real>::count;
       V r2{}, d2{};
@@ -380,8 +389,10 @@ class FieldOf : public SessionField<D> {
     V to_p[D], to_q[D];
     for (int d = 0; d < D; ++d) {
       const V x = load(points_.x[d].data() + at);
-      const Real near_p = static_cast<Real>(p[d]), near_q = static_cast<Real>(q[d]);  // and what rounding has taken from them
-      to_p[d] = (x - near_p) - static_cast<Real>(p[d] - near_p), to_q[d] = (x - near_q) - static_cast<Real>(q[d] - near_q);
+      const Real near_p = static_cast<Real>(p[d]),
+                 near_q = static_cast<Real>(q[d]);  // and what rounding has taken from them
+      to_p[d] = (x - near_p) - static_cast<Real>(p[d] - near_p),
+      to_q[d] = (x - near_q) - static_cast<Real>(q[d] - near_q);
     }
     if constexpr (D == 2 && c == 1 && sizeof(Real) == 4) {
       V r2{}, other2{}, less{};
@@ -399,7 +410,8 @@ class FieldOf : public SessionField<D> {
     }
   }
   /// The tip's part of one block, relative to a landmark: (G_:p - G_:q) s.
-  ECHOSPLINE_INLINE void tip_block(int64_t b, const Vec<D>& p, const Vec<D>& q, const Real* h, const Real (&s)[D], V (&u)[D][VECTORS]) const {
+  ECHOSPLINE_INLINE void tip_block(int64_t b, const Vec<D>& p, const Vec<D>& q, const Real* h, const Real (&s)[D],
+                                   V (&u)[D][VECTORS]) const {
     constexpr int lanes = Lanes<Real>::count;
     V a[planes_of][VECTORS];
     for (int v = 0; v < VECTORS; ++v) {
@@ -464,7 +476,8 @@ class FieldOf : public SessionField<D> {
     }
   }
   /// Field of the gathered landmarks at one block of conditioned points.
-  __attribute__((noinline)) void evaluate_block(int64_t count, const Real (&points)[D][block], V (&u)[D][VECTORS]) const {
+  __attribute__((noinline)) void evaluate_block(int64_t count, const Real (&points)[D][block],
+                                                V (&u)[D][VECTORS]) const {
     V x[D][VECTORS];
     for (int d = 0; d < D; ++d)
       for (int v = 0; v < VECTORS; ++v) x[d][v] = load(points[d] + v * Lanes<Real>::count);

@@ -18,7 +18,7 @@ ECHOSPLINE_INLINE double root(double x) { return std::sqrt(x); }
 template <int D>
 struct ThinPlate {
   static constexpr int components = 1;
-  static constexpr int motions = D + 1;              ///< polynomials
+  static constexpr int motions = D + 1;                ///< polynomials
   static constexpr int length_power = D == 2 ? 2 : 1;  ///< of the kernel's values
   static constexpr double per_spring = D == 2 ? 16 * PI : 8 * PI;
 
@@ -73,7 +73,8 @@ struct Elastic {
     for (int d = 1; d < D; ++d) r2 += offset[d] * offset[d];
     const Number s = r2 + e2, per = Real(1) / s;
     if constexpr (D == 2) {
-      const Number own = (Real(2) * c - Real(4)) * (logarithm(s) + Real(1)) - Real(4) * r2 * per, both = Real(4) * c * per;
+      const Number own = (Real(2) * c - Real(4)) * (logarithm(s) + Real(1)) - Real(4) * r2 * per,
+                   both = Real(4) * c * per;
       for (int a = 0; a < D; ++a)
         for (int b = 0; b < D; ++b) U[a][b] = both * offset[a] * offset[b] + (a == b ? own : own * Real(0));
     } else {
@@ -105,14 +106,15 @@ struct Elastic {
 /// A kernel as the algebra of landmarks sees it, which is the same for all: numbers and functions in double precision.
 template <int D>
 struct KernelOf {
-  int components;      ///< c
-  int motions;         ///< polynomials
-  int length_power;    ///< of the kernel's values
-  double per_spring;   ///< what a spring of stiffness k adds, times k
+  int components;            ///< c
+  int motions;               ///< polynomials
+  int length_power;          ///< of the kernel's values
+  double per_spring;         ///< what a spring of stiffness k adds, times k
   double coupling, radius2;  ///< as `from` takes them
   void (*at)(const KernelOf& own, const Vec<D>& offset, double (&U)[D][D]);
   /// At the offsets from `count` places to x: (c, c) rows of `count` numbers, `stride` from a component of x to the next.
-  void (*along)(const KernelOf& own, const Vec<D>& x, const double* const (&place)[D], int64_t count, double* out, int64_t stride);
+  void (*along)(const KernelOf& own, const Vec<D>& x, const double* const (&place)[D], int64_t count, double* out,
+                int64_t stride);
   void (*motion)(const Vec<D>& x, double* out, int64_t stride);  ///< (c, motions)
 };
 
@@ -125,7 +127,8 @@ struct KernelFunctions {
     for (int a = 0; a < c; ++a)
       for (int e = 0; e < c; ++e) U[a][e] = small[a][e];
   }
-  static void along(const KernelOf<D>& own, const Vec<D>& x, const double* const (&place)[D], int64_t count, double* out, int64_t stride) {
+  static void along(const KernelOf<D>& own, const Vec<D>& x, const double* const (&place)[D], int64_t count,
+                    double* out, int64_t stride) {
     const Kernel kernel = Kernel::from(own.coupling, own.radius2);
     for (int64_t i = 0; i < count; i += DOUBLE_LANES) {
       Doubles offset[D], U[c][c];
@@ -133,7 +136,8 @@ struct KernelFunctions {
       kernel.at(offset, U);
       for (int a = 0; a < c; ++a)
         for (int e = 0; e < c; ++e)
-          for (int64_t l = 0; l < smaller<int64_t>(DOUBLE_LANES, count - i); ++l) out[a * stride + e * count + i + l] = U[a][e][l];
+          for (int64_t l = 0; l < smaller<int64_t>(DOUBLE_LANES, count - i); ++l)
+            out[a * stride + e * count + i + l] = U[a][e][l];
     }
   }
   static void motion(const Vec<D>& x, double* out, int64_t stride) {
@@ -148,8 +152,8 @@ struct KernelFunctions {
 template <int D, class Kernel>
 KernelOf<D> kernel_of(double coupling, double radius2) {
   typedef KernelFunctions<D, Kernel> Functions;
-  return {Kernel::components, Kernel::motions, Kernel::length_power, Kernel::per_spring, coupling,
-          radius2,            Functions::at,   Functions::along,     Functions::motion};
+  return {Kernel::components, Kernel::motions,  Kernel::length_power, Kernel::per_spring, coupling, radius2,
+          Functions::at,      Functions::along, Functions::motion};
 }
 
 }  // namespace echospline::ECHOSPLINE_CORE

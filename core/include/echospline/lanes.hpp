@@ -85,7 +85,9 @@ ECHOSPLINE_INLINE Vector<Real> all(Real x) {
   return Vector<Real>{} + x;
 }
 
-ECHOSPLINE_INLINE Floats pick(Ints where, Floats a, Floats b) { return (Floats)((where & (Ints)a) | (~where & (Ints)b)); }
+ECHOSPLINE_INLINE Floats pick(Ints where, Floats a, Floats b) {
+  return (Floats)((where & (Ints)a) | (~where & (Ints)b));
+}
 ECHOSPLINE_INLINE Doubles pick(Longs where, Doubles a, Doubles b) {
   return (Doubles)((where & (Longs)a) | (~where & (Longs)b));
 }
@@ -143,12 +145,21 @@ ECHOSPLINE_INLINE Doubles logarithm(Doubles x) {
   return e * 0.693147180559945309417 + (s * 2.0 + s * z * p);
 }
 
-/// Sum over the lanes, in a fixed order.
-ECHOSPLINE_INLINE double total(Doubles v) {
-  double s = 0;
-  for (int i = 0; i < DOUBLE_LANES; ++i) s += v[i];
-  return s;
+typedef double Doubles2 __attribute__((vector_size(16)));
+typedef double Doubles4 __attribute__((vector_size(32)));
+typedef double Doubles8 __attribute__((vector_size(64)));
+/// Sum of the two halves of a vector.
+template <class Half, class Whole>
+ECHOSPLINE_INLINE Half fold(const Whole& v) {
+  Half a, b;
+  std::memcpy(&a, &v, sizeof a);
+  std::memcpy(&b, reinterpret_cast<const char*>(&v) + sizeof a, sizeof b);
+  return a + b;
 }
+/// Sum over the lanes, in an order that depends on the level's width alone.
+ECHOSPLINE_INLINE double total(const Doubles2& v) { return v[0] + v[1]; }
+ECHOSPLINE_INLINE double total(const Doubles4& v) { return total(fold<Doubles2>(v)); }
+ECHOSPLINE_INLINE double total(const Doubles8& v) { return total(fold<Doubles4>(v)); }
 template <class Real>
 ECHOSPLINE_INLINE Real largest(Vector<Real> v) {
   Real s = v[0];
