@@ -48,7 +48,7 @@ class FineField {
   template <class Landmarks>
   void compute(const Field<D, Real>& coarse_field, const Landmarks& landmarks, const Kernel& kernel, const Vec<D>& centre, double scale) {
     interpolate(coarse_field);
-    const Real* p = landmarks.values;
+    const auto* p = landmarks.values;
     for (int64_t i = 0; i < landmarks.count; ++i, p += 2 * D) correct(p, p + D, kernel, centre, scale);
   }
 
@@ -114,10 +114,13 @@ class FineField {
   }
 
   /// Add what interpolation leaves out of one landmark's field.
-  void correct(const Real* place, const Real* weight, const Kernel& kernel, const Vec<D>& centre, double scale) {
+  template <class Number>
+  void correct(const Number* place, const Number* weights, const Kernel& kernel, const Vec<D>& centre, double scale) {
     const Grid<D>& coarse = coarse_.grid;
     const int64_t nx = fine_.shape[0], ny = fine_.shape[1];
     double at[D], step[D], first[D];
+    Real weight[D];
+    for (int d = 0; d < D; ++d) weight[d] = static_cast<Real>(weights[d]);
     int64_t cell[D], begin[D], end[D];
     for (int d = 0; d < D; ++d) {
       at[d] = place[d] * scale + centre[d];

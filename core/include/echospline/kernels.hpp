@@ -13,6 +13,7 @@ constexpr double PI = 3.14159265358979323846;
 
 ECHOSPLINE_INLINE double logarithm(double x) { return x > 0 ? std::log(x) : 0.0; }
 ECHOSPLINE_INLINE double root(double x) { return std::sqrt(x); }
+ECHOSPLINE_INLINE double inverse_root(double x) { return 1 / std::sqrt(x); }
 
 /// U(r) = r^2 ln r^2 in the plane, equation (3), and -r in space; one scalar serves all components, with the affine motions of equation (5).
 template <int D>
@@ -31,6 +32,13 @@ struct ThinPlate {
       U[0][0] = r2 * logarithm(r2);
     else
       U[0][0] = -root(r2);
+  }
+  /// Add U at an offset times a weight.
+  template <class Number, class Real>
+  ECHOSPLINE_INLINE void respond(const Number (&offset)[D], const Real* weight, Number (&u)[D]) const {
+    Number U[1][1];
+    at(offset, U);
+    for (int d = 0; d < D; ++d) u[d] += weight[d] * U[0][0];
   }
   /// U at squared distance r2 less U at other2 in the plane, single precision; `less` is the difference of the two. Accurate to the last digits of the difference, where each U is much larger.
   template <class Number>
@@ -63,21 +71,22 @@ struct Elastic {
 
   template <class Number>
   ECHOSPLINE_INLINE void at(const Number (&offset)[D], Number (&U)[D][D]) const {
-    typedef std::remove_cvref_t<decltype(scalar(offset[0]))> Real;
-    const Real c = static_cast<Real>(coupling), e2 = static_cast<Real>(radius2);
-    Number r2 = offset[0] * offset[0];
-    for (int d = 1; d < D; ++d) r2 += offset[d] * offset[d];
-    const Number s = r2 + e2, per = Real(1) / s;
-    if constexpr (D == 2) {
-      const Number own = (Real(2) * c - Real(4)) * (logarithm(s) + Real(1)) - Real(4) * r2 * per, both = Real(4) * c * per;
-      for (int a = 0; a < D; ++a)
-        for (int b = 0; b < D; ++b) U[a][b] = both * offset[a] * offset[b] + (a == b ? own : own * Real(0));
-    } else {
-      const Number p = root(per), p3 = p * per;  // 1 / r_e, 1 / r_e^3
-      const Number own = (Real(4) - c) * p + Real(2) * e2 * p3, both = c * p3;
-      for (int a = 0; a < D; ++a)
-        for (int b = 0; b < D; ++b) U[a][b] = both * offset[a] * offset[b] + (a == b ? own : own * Real(0));
-    }
+    Number own, both;
+    parts(offset, own, both);
+    for (int a = 0; a < D; ++a)
+      for (int b = 0; b < D; ++b) {
+        U[a][b] = both * offset[a] * offset[b];
+        if (a == b) U[a][b] += own;
+      }
+  }
+  /// Add U at an offset times a weight.
+  template <class Number, class Real>
+  ECHOSPLINE_INLINE void respond(const Number (&offset)[D], const Real* weight, Number (&u)[D]) const {
+    Number own, both, along = weight[0] * offset[0];
+    parts(offset, own, both);
+    for (int d = 1; d < D; ++d) along += weight[d] * offset[d];
+    along *= both;
+    for (int d = 0; d < D; ++d) u[d] += own * weight[d] + along * offset[d];
   }
   /// Rigid motions at a point: shifts, then rotations.
   static void motion(const Vec<D>& x, double (&R)[D][motions]) {
@@ -93,6 +102,22 @@ struct Elastic {
   }
 
  private:
+  /// What stands before the unit matrix and before x x' in U at an offset x.
+  template <class Number>
+  ECHOSPLINE_INLINE void parts(const Number (&offset)[D], Number& own, Number& both) const {
+    typedef std::remove_cvref_t<decltype(scalar(offset[0]))> Real;
+    const Real c = static_cast<Real>(coupling), e2 = static_cast<Real>(radius2);
+    Number r2 = offset[0] * offset[0];
+    for (int d = 1; d < D; ++d) r2 += offset[d] * offset[d];
+    const Number s = r2 + e2;
+    if constexpr (D == 2) {
+      const Number per = Real(1) / s;
+      own = (Real(2) * c - Real(4)) * (logarithm(s) + Real(1)) - Real(4) * r2 * per, both = Real(4) * c * per;
+    } else {
+      const Number p = inverse_root(s), p3 = p * p * p;  // 1 / r_e, 1 / r_e^3
+      own = p3 * ((Real(4) - c) * s + Real(2) * e2), both = c * p3;
+    }
+  }
   static float scalar(Floats);
   static double scalar(Doubles);
   static double scalar(double);

@@ -10,7 +10,8 @@
 //
 // Weights of landmarks that stand close together are large and of both signs. So that single precision is enough, a column is kept as its
 // difference to that of the nearest landmark at the time it joined, its parent: an anchor, whose column is zero, or another contact, which
-// then carries its children's weights beside its own.
+// then carries its children's weights beside its own. Where kernels are evaluated directly, sums of groups of landmarks are compensated
+// (Kahan), and the thin plate in the plane, whose terms are far larger than their sum, is evaluated in double.
 #pragma once
 #include "anchored_kernel.hpp"
 
@@ -20,6 +21,7 @@ constexpr double RESIDUAL = 1e-6;  // mm; misfit at the landmarks, for displacem
 constexpr double CAREFUL = 35;    // weight times sum of anchors' shares beyond which a tip's column is computed in double: its last digits
                                    // would be more than 1e-5 mm of the field
 constexpr int VECTORS = 4;         // registers whose sums one pass over the landmarks fills
+constexpr int64_t GROUP = 16;      // landmarks that are summed plainly, before compensated sums of groups; more: less exact, fewer: slower
 
 /// Points at which the field is wanted, as vectors read them: blocks of VECTORS registers, the last one filled up with the last point.
 template <int D, class Real>
@@ -158,6 +160,7 @@ class Response {
   static constexpr bool by_difference = D == 2 && c == 1 && sizeof(Real) == 4;
   static constexpr int64_t planes = c == 1 ? 1 : D;  ///< of a column per component of its source
   static constexpr int64_t block = Points<D, Real>::block;
+  typedef std::conditional_t<D == 2 && c == 1, double, Real> Direct;  ///< in which kernels are evaluated directly
   typedef AnchoredKernel<D, Kernel> Anchored;
   typedef Column<D, c> Tip;
   typedef Sides<D, c> Displacements;
@@ -741,8 +744,8 @@ class Response {
   /// Landmarks as the evaluation reads them: (place, weight) of each, then the motions' coefficients.
   struct Landmarks {
     int64_t count;
-    const Real* values;   ///< (count, 2 D)
-    const Real* motions;  ///< (motions, D) of the affine motions, (motions) of the rigid ones
+    const Direct* values;   ///< (count, 2 D)
+    const Direct* motions;  ///< (motions, D) of the affine motions, (motions) of the rigid ones
   };
   /// Room for `gather`.
   bool reserve_landmarks() {
@@ -754,52 +757,60 @@ class Response {
     const int64_t total = landmarks(w, tip, s, gathered_places_, gathered_weights_);
     for (int64_t i = 0; i < total; ++i)
       for (int d = 0; d < D; ++d) {
-        gathered_[i * 2 * D + d] = static_cast<Real>(gathered_places_[i * D + d]);
-        gathered_[i * 2 * D + D + d] = static_cast<Real>(gathered_weights_[i * D + d]);
+        gathered_[i * 2 * D + d] = static_cast<Direct>(gathered_places_[i * D + d]);
+        gathered_[i * 2 * D + D + d] = static_cast<Direct>(gathered_weights_[i * D + d]);
       }
-    Real* motions = gathered_.data() + total * 2 * D;
-    for (int64_t j = 0; j < Kernel::motions * D; ++j) motions[j] = static_cast<Real>(gathered_weights_[total * D + j]);
+    Direct* motions = gathered_.data() + total * 2 * D;
+    for (int64_t j = 0; j < Kernel::motions * D; ++j) motions[j] = static_cast<Direct>(gathered_weights_[total * D + j]);
     return {total, gathered_.data(), motions};
   }
+  static constexpr int64_t direct_block = VECTORS * Lanes<Direct>::count;
   /// Field of the landmarks at one block of conditioned points, `stride` numbers from one component to the next.
-  __attribute__((noinline)) void evaluate(const Landmarks& all_landmarks, const Real* points, int64_t stride, V (&u)[D][VECTORS]) const {
-    V x[D][VECTORS];
+  __attribute__((noinline)) void evaluate(const Landmarks& all_landmarks, const Direct* points, int64_t stride,
+                                          Vector<Direct> (&u)[D][VECTORS]) const {
+    typedef Vector<Direct> N;
+    N x[D][VECTORS];
     for (int d = 0; d < D; ++d)
-      for (int v = 0; v < VECTORS; ++v) x[d][v] = load(points + d * stride + v * Lanes<Real>::count);
-    const Real* a = all_landmarks.motions;
+      for (int v = 0; v < VECTORS; ++v) x[d][v] = load(points + d * stride + v * Lanes<Direct>::count);
+    const Direct* a = all_landmarks.motions;
     for (int d = 0; d < D; ++d)
       for (int v = 0; v < VECTORS; ++v) {
         if constexpr (c == 1) {
-          u[d][v] = all<Real>(a[d]);
+          u[d][v] = all<Direct>(a[d]);
           for (int e = 0; e < D; ++e) u[d][v] += a[(e + 1) * D + d] * x[e][v];
         } else if constexpr (D == 2) {
           u[d][v] = a[d * D] + (d == 0 ? -a[2 * D] : a[2 * D]) * x[1 - d][v];
         } else {
-          const Real about_z = a[3 * D], about_x = a[4 * D], about_y = a[5 * D];
+          const Direct about_z = a[3 * D], about_x = a[4 * D], about_y = a[5 * D];
           u[d][v] = a[d * D] + (d == 0   ? about_y * x[2][v] - about_z * x[1][v]
                                 : d == 1 ? about_z * x[0][v] - about_x * x[2][v]
                                          : about_x * x[1][v] - about_y * x[0][v]);
         }
       }
-    const Real* p = all_landmarks.values;
-    for (int64_t i = 0; i < all_landmarks.count; ++i, p += 2 * D)
-      for (int v = 0; v < VECTORS; ++v) {
-        V offset[D], U[c][c];
-        for (int d = 0; d < D; ++d) offset[d] = x[d][v] - p[d];
-        anchored_->kernel.at(offset, U);
-        for (int d = 0; d < D; ++d) {
-          if constexpr (c == 1) {
-            u[d][v] += p[D + d] * U[0][0];
-          } else {
-            for (int e = 0; e < D; ++e) u[d][v] += p[D + e] * U[d][e];
-          }
+    N lost[D][VECTORS] = {};
+    for (int64_t first = 0; first < all_landmarks.count; first += GROUP) {
+      N sum[D][VECTORS] = {};
+      const Direct* p = all_landmarks.values + first * 2 * D;
+      const Direct* end = all_landmarks.values + smaller(first + GROUP, all_landmarks.count) * 2 * D;
+      for (; p < end; p += 2 * D)
+        for (int v = 0; v < VECTORS; ++v) {
+          N offset[D], own[D];
+          for (int d = 0; d < D; ++d) offset[d] = x[d][v] - p[d], own[d] = sum[d][v];
+          anchored_->kernel.respond(offset, p + D, own);
+          for (int d = 0; d < D; ++d) sum[d][v] = own[d];
         }
-      }
+      for (int d = 0; d < D; ++d)
+        for (int v = 0; v < VECTORS; ++v) {
+          const N more = sum[d][v] - lost[d][v], next = u[d][v] + more;
+          lost[d][v] = (next - u[d][v]) - more;
+          u[d][v] = next;
+        }
+    }
   }
 
  private:
   Array<double> gathered_places_, gathered_weights_;
-  Array<Real> gathered_;
+  Array<Direct> gathered_;
 };
 
 }  // namespace echospline::ECHOSPLINE_CORE

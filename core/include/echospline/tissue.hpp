@@ -132,16 +132,17 @@ class Tissue {
     typename ResponseOf::Landmarks landmarks;
     const Outcome outcome = present(landmarks);
     if (outcome != done) return outcome;
-    constexpr int lanes = Lanes<Real>::count;
-    constexpr int64_t block = Points<D, Real>::block;
+    typedef typename ResponseOf::Direct Direct;
+    constexpr int lanes = Lanes<Direct>::count;
+    constexpr int64_t block = ResponseOf::direct_block;
     const bool still = !state.tip.present && state.count == 0;
     for (int64_t first = 0; first < count; first += block) {
-      Real at[D][block];
+      Direct at[D][block];
       for (int64_t i = 0; i < block; ++i) {
         const Vec<D> p = scene.anchored.conditioned(place(smaller(first + i, count - 1)));
-        for (int d = 0; d < D; ++d) at[d][i] = static_cast<Real>(p[d]);
+        for (int d = 0; d < D; ++d) at[d][i] = static_cast<Direct>(p[d]);
       }
-      Vector<Real> u[D][VECTORS] = {};
+      Vector<Direct> u[D][VECTORS] = {};
       if (!still) response_.evaluate(landmarks, at[0], block, u);
       for (int64_t i = 0; i < smaller(block, count - first); ++i) {
         Vec<D> moved;
