@@ -21,7 +21,7 @@ constexpr double RESIDUAL = 1e-6;  // mm; misfit at the landmarks, for displacem
 constexpr double CAREFUL = 35;    // weight times sum of anchors' shares beyond which a tip's column is computed in double: its last digits
                                    // would be more than 1e-5 mm of the field
 constexpr int VECTORS = 4;         // registers whose sums one pass over the landmarks fills
-constexpr int64_t GROUP = 16;      // landmarks that are summed plainly, before compensated sums of groups; more: less exact, fewer: slower
+constexpr int64_t GROUP = 16;      // landmarks summed plainly before sums are compensated; more: less exact, fewer: slower
 
 /// Points at which the field is wanted, as vectors read them: blocks of VECTORS registers, the last one filled up with the last point.
 template <int D, class Real>
@@ -761,7 +761,8 @@ class Response {
         gathered_[i * 2 * D + D + d] = static_cast<Direct>(gathered_weights_[i * D + d]);
       }
     Direct* motions = gathered_.data() + total * 2 * D;
-    for (int64_t j = 0; j < Kernel::motions * D; ++j) motions[j] = static_cast<Direct>(gathered_weights_[total * D + j]);
+    for (int64_t j = 0; j < Kernel::motions * D; ++j)
+      motions[j] = static_cast<Direct>(gathered_weights_[total * D + j]);
     return {total, gathered_.data(), motions};
   }
   static constexpr int64_t direct_block = VECTORS * Lanes<Direct>::count;
