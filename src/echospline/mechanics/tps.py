@@ -100,7 +100,9 @@ class TPSModel:
         )
         self.native: NativeStep | None = None
         if solver == "response":
-            self.native = NativeStep(grid, self.clamps, self.parameters, self.kernel, self.stiffness, precision)
+            self.native = NativeStep(
+                grid, self.clamps, self.parameters, self.kernel, self.stiffness, precision
+            )
 
     def rest(self) -> State:
         """State of tissue that no needle has touched."""
