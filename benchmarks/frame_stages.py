@@ -33,7 +33,7 @@ def measure(nodes: tuple[int, int], kind: str) -> dict[str, float]:
     )
     model = build_model(scenario, scenario.grid(image))
     with tempfile.TemporaryDirectory() as out:
-        run(scenario, image, model, Path(out) / "first", Path())  # fills caches
+        run(scenario, image, model, Path(out) / "first", Path())  # compiles and warms up
         report = run(scenario, image, model, Path(out) / "second", Path())
     return {name: ms["median"] for name, ms in report["milliseconds_per_frame"].items()}
 
