@@ -34,7 +34,7 @@ def main() -> None:
         one = args.out / "one.zarr"
         create_store(one, load(base), args.n, 8, 0, ["dataset.toml"])
         peak = []
-        make_sample(store=str(one), bases=[str(base)], index=0, seed=0, frames=8)  # compiles, loads
+        make_sample(store=str(one), bases=[str(base)], index=0, seed=0, frames=8)  # loads
         wall, used = time.perf_counter(), time.process_time()
         for i in range(args.n):
             make_sample(store=str(one), bases=[str(base)], index=i, seed=0, frames=8)

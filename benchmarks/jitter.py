@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from echospline.mechanics import describe_core
 from echospline.scene import NeedlePose
 from echospline.study.bench import MESHES, scene
 
@@ -38,7 +39,7 @@ def poses():
 def run(seconds, model, keep):
     """Step at 1 kHz; a step that is still due when the next one is skips it."""
     state, path = model.rest(), poses()
-    for _ in range(2000):  # contacts and patches as in the middle of a session
+    for _ in range(2000):  # contacts as in the middle of a session
         state = model.advance(state, next(path), PERIOD)
     count = int(seconds / PERIOD)
     own, late, missed, done = np.full((2, count), np.nan), np.full(count, np.nan), 0, 0
@@ -70,7 +71,7 @@ def report(own, late, missed, count, model):
         "late_ms": dict(zip(map(str, levels), np.quantile(late, levels).tolist(), strict=True)),
         "missed": missed,
         "periods": count,
-        "statistics": vars(model.fast.response.statistics),
+        "statistics": vars(model.native.statistics),
     }
 
 
@@ -147,6 +148,7 @@ def main():
     neighbour.start()
     try:
         found = {
+            "core": describe_core(),
             "thread": in_thread(options.seconds),
             "process": in_process(options.seconds, False),
             "process, SCHED_FIFO": in_process(options.seconds, True),

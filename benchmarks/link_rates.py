@@ -26,7 +26,7 @@ from threadpoolctl import threadpool_limits
 
 from echospline.cli.link import make_stage
 from echospline.openigtlink import Link, Looks, Message, Rates, Session, SessionOptions, Transform
-from echospline.openigtlink.crc64 import crc64, warm_up
+from echospline.openigtlink.crc64 import crc64
 from echospline.openigtlink.decoder import Decoder
 from echospline.openigtlink.image import Image
 from echospline.openigtlink.message import encode
@@ -47,7 +47,6 @@ def needle(now: float) -> np.ndarray:
 
 def listen(port: int, seconds: float, pause: float, transforms: float, pipe: Connection) -> None:
     """Peer process: read images (sleeping ``pause`` after each), send transforms; report ages and counts."""
-    warm_up()
     sys.setswitchinterval(0.0005)  # the peer's two threads shall not wait 5 ms for each other
     connection = socket.create_connection(("127.0.0.1", port))
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -240,7 +239,6 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=60.0)
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
-    warm_up()
     report: dict[str, Any] = {"codec_ms": codec(), "rows": []}
     print("codec, median ms")
     for name, ms in report["codec_ms"].items():

@@ -1,11 +1,11 @@
-"""Where the microseconds of one plain step go.
+"""Where the microseconds of one step go: the calls of the core that a step from Python makes, one by one.
 
     python benchmarks/step_profile.py
 
-Each part is timed by a call of its own from Python, so it carries about a microsecond of calling that the whole step, one
-call, pays once. Minimum and median of 2000.
+Least and median of the last quarter of a push at 1 kHz. Contacts join and leave in some of its steps; those are a line of their own.
 """
 
+import ctypes
 import os
 
 os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
@@ -14,78 +14,75 @@ from time import perf_counter
 
 import numpy as np
 
-from echospline.mechanics import compiled_step, mesh_field, tip_column, touch
-from echospline.mechanics.tip_patch import NODES
-from echospline.study.bench import MESHES, path, scene
+from echospline import _native as core
+from echospline.mechanics import Elastic, ThinPlate, describe_core
+from echospline.study.bench import MESHES, PERIOD, bare_product, path, scene, time_steps
 
 
-def timed(name, call, repeats=2000):
-    call()
-    times = np.empty(repeats)
-    for i in range(repeats):
-        begin = perf_counter()
-        call()
-        times[i] = perf_counter() - begin
-    print(f"  {name:58} {1e6 * times.min():7.1f} {1e6 * np.median(times):7.1f} us")
+def show(name, seconds):
+    print(f"  {name:48} {1e6 * np.min(seconds):7.1f} {1e6 * np.median(seconds):7.1f} us")
 
 
-def profile(shape):
-    model = scene(shape)
-    f, state, poses = model.fast, model.rest(), list(path())
-    r, s = f.response, f.setting
-    for pose in poses[:2400]:
-        state = model.advance(state, pose, 1e-3)
-    for pose in poses[2400:]:
-        built = r.statistics.built
-        state = model.advance(state, pose, 1e-3)
-        if r.statistics.built == built:
-            break
-    b, table, tip, k, plain = r.basis, state.landmarks, state.tip, len(state.landmarks), np.empty(0)
-    needle = touch.needle(*pose.entry, *pose.tip, pose.speed, 1e-3, False, tip, plain)
-    q = np.ascontiguousarray(table[:, 2:4])
-    x, y = (np.array(pose.tip) - r.scene.centre) / r.scene.scale
-    which, alongs, none = np.empty(len(r.at), dtype=np.int64), np.empty(len(r.at)), np.empty((0, 2))
-    tip_column.meet(b, x, y)
+def calls(step, poses):
+    """Seconds of each of the core's calls in each step of a push from rest, and whether contacts changed in it."""
+    library, tissue, pose = core.library(), step._tissue, core.Pose(dt=PERIOD)
+    nodes = library.echospline_scene_node_count(step._scene)
+    single, double = np.empty((nodes, 2), np.float32), np.empty((nodes, 2))
+    state = ctypes.create_string_buffer(1 << 16)
+    statistics = core.Statistics(struct_size=ctypes.sizeof(core.Statistics))
+    parts = {
+        "the step: echospline_advance": lambda: library.echospline_advance(tissue, pose),
+        "mesh in single precision": lambda: library.echospline_displacement_single(
+            tissue, single.ctypes.data, single.size
+        ),
+        "mesh in double precision": lambda: library.echospline_displacement(
+            tissue, double.ctypes.data, double.size
+        ),
+        "state as bytes": lambda: library.echospline_state_save(tissue, state, len(state)),
+        "statistics": lambda: library.echospline_tissue_statistics(tissue, statistics),
+    }
+    library.echospline_tissue_reset(tissue)
+    seconds, changes = np.empty((len(poses), len(parts))), [0]
+    for i, p in enumerate(poses):
+        pose.entry[:2], pose.tip[:2], pose.speed = p.entry, p.tip, p.speed
+        for j, call in enumerate(parts.values()):
+            begin = perf_counter()
+            status = call()
+            seconds[i, j] = perf_counter() - begin
+            assert status == core.Status.OK
+        changes.append(statistics.joined + statistics.left)
+    return dict(zip(parts, seconds.T, strict=True)), np.diff(changes) > 0
+
+
+def profile(shape, kernel):
+    model, poses = scene(shape, kernel), list(path())
+    in_python, landmarks = time_steps(model, poses)
+    late = np.arange(len(poses)) > 0.75 * len(poses)
+    found, changed = calls(scene(shape, kernel).native, poses)
     print(
-        f"{model.grid.size} nodes, {k} contacts, {len(model.anchors)} anchors, {len(model.lattice)} possible contacts, "
-        f"{r.near_count.max()} nodes near the tip"
+        f"{type(kernel).__name__}, {model.grid.size} nodes, {landmarks} moving landmarks, {len(model.anchors)} anchors, "
+        f"{len(model.lattice)} possible contacts"
     )
-    n = r.single.shape[1]
-    rows, weights, out = (
-        r.single[r.head : r.head + k],
-        np.ones((2, k), np.float32),
-        np.empty((2, n), np.float32),
-    )
-    timed("the limit: bare product of the contacts' rows", lambda: np.dot(weights, rows, out=out))
-    every = r.single[r.head - len(NODES) : r.head + k]
-    more = np.ones((2, len(every)), np.float32)
-    timed("the same with the patch's rows", lambda: np.dot(more, every, out=out))
-    timed(
-        "which nodes touch the needle",
-        lambda: touch.touch(
-            s.places, f.lines, r.at, state.mesh, table, needle, s.numbers, tip[11], which, alongs
-        ),
-    )
-    timed("friction and relaxation", lambda: touch.load(s.places, table, needle, s.numbers, q))
-    timed("the tip against anchors and contacts", lambda: tip_column.meet(b, x, y))
-    timed("the same without a patch", lambda: tip_column.meet_exactly(b, x, y))
-    tip_column.meet(b, x, y)
-    timed("weights of the contacts", lambda: mesh_field.combine(b, table, q))
-    timed("all of the field", lambda: mesh_field.spread(b, k, tip, -1, 0.0, state.mesh))
-    timed(
-        "  without looking for the largest change",
-        lambda: mesh_field.spread(b, k, tip, -1, 0.0, none),
-    )
-    timed(
-        "all of it, one compiled call",
-        lambda: compiled_step.step(
-            b, s.places, f.lines, s.posts, s.walls, s.numbers, table, tip, state.mesh, plain, *pose.entry, *pose.tip,
-            pose.speed, 1e-3,
-        ),
-    )  # fmt: skip
-    timed("the whole step, from pose to mesh", lambda: model.displacement(model.advance(state, pose, 1e-3)))
+    limit = bare_product(model.grid.size, landmarks, kernel.components)
+    print(f"  {'the limit: bare product':48} {'':7} {1e6 * limit:7.1f} us")
+    first, *others = found
+    show(first, found[first][late & ~changed])
+    show("the same while contacts join or leave", found[first][late & changed])
+    for name in others:
+        show(name, found[name][late])
+    show("a call that does nothing, timed", [timed_nothing() for _ in range(2000)])
+    show("all of a step from Python, pose to mesh", in_python[late])
+
+
+def timed_nothing():
+    version = core.library().echospline_version
+    begin = perf_counter()
+    version()
+    return perf_counter() - begin
 
 
 if __name__ == "__main__":
-    for shape in MESHES.values():
-        profile(shape)
+    print("core {version}, level {level}".format(**describe_core()))
+    for kernel in (ThinPlate(), Elastic()):
+        for shape in MESHES.values():
+            profile(shape, kernel)

@@ -15,6 +15,7 @@ import pytest
 from PIL import Image
 
 from echospline.io import read, read_displacement
+from echospline.mechanics import describe_core
 from echospline.scenario import load
 
 SMALL = [
@@ -49,6 +50,7 @@ def test_a_run_leaves_everything_it_names(done):
     assert not list(out.glob("*.part"))
     assert json.loads((out / "run.json").read_text()) == report
     assert report["parameters"]["needle"]["depth"] == 6.0
+    assert report["core"] == describe_core()
     assert set(report["milliseconds_per_frame"]) == {
         "interaction", "spline", "inverse map", "warp", "needle", "write",
     }  # fmt: skip

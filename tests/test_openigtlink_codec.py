@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from echospline.errors import InputError, ProtocolError
 from echospline.openigtlink import Message, Position, Status, String, Transform
-from echospline.openigtlink.crc64 import POLYNOMIAL, crc64
+from echospline.openigtlink.crc64 import crc64
 from echospline.openigtlink.decoder import BOUND, BOUNDS, Decoder
 from echospline.openigtlink.header import HEADER_SIZE, Header
 from echospline.openigtlink.image import Image
@@ -50,7 +50,7 @@ def test_check_sum_has_the_catalogued_value_of_crc_64_ecma_182() -> None:
 
 @given(st.binary(max_size=100))
 def test_check_sum_is_the_remainder_of_polynomial_division(data: bytes) -> None:
-    divisor, remainder = POLYNOMIAL | 1 << 64, int.from_bytes(data, "big") << 64
+    divisor, remainder = 0x42F0E1EBA9EA3693 | 1 << 64, int.from_bytes(data, "big") << 64
     for bit in range(remainder.bit_length() - 1, 63, -1):
         if remainder >> bit & 1:
             remainder ^= divisor << bit - 64

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -103,6 +104,62 @@ def test_a_step_does_not_change_the_state_it_starts_from():
         assert state.saved == saved
         assert np.array_equal(state.mesh, mesh)
         state = after
+
+
+def jumping(seed, steps):
+    """Poses that have nothing to do with each other: at every step most contacts leave and others join."""
+    rng = np.random.default_rng(seed)
+    for _ in range(steps):
+        entry, angle, depth = rng.uniform(6, 34), rng.uniform(0.9, 2.2), rng.uniform(3, 24)
+        tip = (float(entry + depth * np.cos(angle)), float(depth * np.sin(angle)))
+        yield NeedlePose(
+            (float(entry), 0.0), (min(max(tip[0], 2.0), 38.0), tip[1]), float(rng.uniform(-8, 8))
+        )
+
+
+@pytest.mark.parametrize("kernel", KERNELS, ids=["thin plate", "elastic"])
+@pytest.mark.parametrize(("precision", "within"), [("double", 1e-7), ("single", 1e-5)])
+def test_hundreds_of_joins_and_leaves_leave_no_trace_of_rounding(kernel, precision, within):
+    parameters = replace(PRINTED, contact_spacing=1.5, delta=1.3)
+    slow, fast = pair(precision, parameters, kernel=kernel)
+    state = fast.rest()
+    for pose in jumping(6, 60):
+        state = fast.advance(state, pose, 0.1)
+    done = fast.native.statistics
+    assert done.joined > 500
+    assert done.left > 500
+    assert done.residual < 1e-7  # at the landmarks, for displacements of 1 mm
+    field = slow.reference.spline(fast.landmarks(state))  # the core's landmarks, fitted anew
+    assert np.abs(field(GRID.nodes) - fast.displacement(state)).max() < within
+
+
+def test_states_advanced_from_several_threads_are_those_of_one():
+    _, model = pair("single")
+    paths = [list(wandering(seed, 1 / 20, 3.0)) for seed in range(4)]
+
+    def states(poses):
+        state, meshes = model.rest(), []
+        for pose in poses:
+            state = model.advance(state, pose, 1 / 20)
+            meshes.append(model.displacement(state))
+        return np.array(meshes)
+
+    alone = [states(poses) for poses in paths]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(states, paths))
+    for one, two in zip(alone, together, strict=True):
+        assert np.abs(one).max() > 0.1
+        # going from one thread's state to another's loads bytes, and rounds differently
+        assert np.abs(one - two).max() < 1e-5
+
+
+def test_a_still_needle_changes_nothing_in_no_time():
+    _, model = pair()
+    state, poses = model.rest(), list(wandering(9, 1 / 20, 4.0))
+    for pose in poses:
+        state = model.advance(state, pose, 1 / 20)
+        again = model.advance(state, replace(pose, speed=0.0), 0.0)
+        assert np.abs(again.mesh - state.mesh).max() < 1e-12
 
 
 def test_a_tip_beside_a_clamped_edge_is_refitted_in_effect():

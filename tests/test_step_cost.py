@@ -1,108 +1,174 @@
-"""What one step costs, counted, not timed: rows read, calls made, blocks allocated."""
+"""Work that one step takes, counted, not timed: calls of the core, its allocations, blocks of the heap."""
 
 from __future__ import annotations
 
-import gc
-from dataclasses import replace
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
 
-import numpy as np
 import pytest
-from numba.core.runtime import _nrt_python, rtsys
 
-from echospline.mechanics import TPSModel, fused, tps
-from echospline.mechanics.tip_patch import NODES
+from echospline import _native
+from echospline.mechanics import Elastic, ThinPlate, TPSModel
 from echospline.scene import NeedlePose, RegularGrid
+from paths import wandering
 
-BLOCKS = 13
-"""Blocks of memory that the compiled part of a plain step asks for: one to refer to each of the nine arrays that it is
-handed, the pose, and the new state's three."""
+ROOT = Path(__file__).resolve().parent.parent
+CC = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+KERNELS = [ThinPlate(), Elastic()]
+OF_A_STEP = [
+    "echospline_advance",
+    "echospline_state_size",
+    "echospline_state_save",
+    "echospline_tissue_statistics",
+    "echospline_displacement",
+]
+"""The step, its state as a value, and the displacement of the mesh."""
+
+
+class Counted:
+    """The core's library, every call noted."""
+
+    def __init__(self, library):
+        self.library, self.calls = library, []
+
+    def __getattr__(self, name):
+        function = getattr(self.library, name)
+
+        def call(*arguments):
+            self.calls.append(name)
+            return function(*arguments)
+
+        return call
+
+
+def grid_of(nx, ny):
+    return RegularGrid((nx, ny), (40 / (nx - 1), 30 / (ny - 1)))
 
 
 def pose(i):
     return NeedlePose((13.3, 0.0), (13.3 + 0.004 * i, 0.01 * i), 10.8)
 
 
-def settled(shape=(30, 24), steps=1200):
-    """A model in the middle of a push, its contacts and its patch complete: the next step is a plain one."""
-    grid = RegularGrid(shape, (40 / (shape[0] - 1), 30 / (shape[1] - 1)))
-    model = TPSModel(grid)
-    state, i, work = model.rest(), 0, model.fast.response.statistics
-    while True:
-        before, after = replace(work), model.advance(state, pose(i + 1), 1e-3)
-        if i >= steps and work == before:
-            return model, state, i
-        state, i = after, i + 1
+def counted_model(grid, **kw):
+    model = TPSModel(grid, **kw)
+    model.native._core = Counted(model.native._core)
+    return model, model.native._core.calls
 
 
-@pytest.fixture(scope="module")
-def middle():
-    return settled()
-
-
-def step(model, state, i):
-    return model.advance(state, pose(i + 1), 1e-3)
-
-
-def test_a_plain_step_reads_one_row_per_contact_and_those_of_the_patch(middle):
-    model, state, i = middle
-    r = model.fast.response
-    clean = step(model, state, i).mesh
-    patch = int(r.met[0]) * len(NODES)
-    used = [*range(patch, patch + len(NODES)), *range(r.head, r.head + r.count)]
-    kept = r.single.copy()
-    try:
-        for row in range(len(r.single)):
-            r.single[row] = np.nan
-            dirty = step(model, state, i).mesh
-            r.single[row] = kept[row]
-            assert np.isnan(dirty).all() == (row in used), row
-            assert np.isnan(dirty).any() == (row in used), row
-        r.rows[:], double = np.nan, r.rows.copy()  # the double rows are not read at all
-        assert np.array_equal(step(model, state, i).mesh, clean)
-        r.rows[:] = double
-    finally:
-        r.single[:] = kept
-    assert len(used) == 10 + len(state.landmarks)
-
-
-def test_a_plain_step_is_one_compiled_call_and_no_fit(middle, monkeypatch):
-    model, state, i = middle
-    calls = []
-    compiled = fused.step
-    monkeypatch.setattr(fused, "step", lambda *a: calls.append("step") or compiled(*a))
-    for owner, name in ((fused, "move"), (fused, "needle"), (tps, "factor")):
-        monkeypatch.setattr(owner, name, lambda *_, name=name: calls.append(name))
-    for name in ("prepare", "set_contacts", "field", "rebuild", "before"):
-        monkeypatch.setattr(model.fast.response, name, lambda *_, name=name: calls.append(name))
-    step(model, state, i)
-    assert calls == ["step"]
-
-
-def test_a_step_that_changes_contacts_updates_once_and_calls_twice(monkeypatch):
-    model, state, i = settled()
-    calls = []
-    compiled, r = fused.step, model.fast.response
-    monkeypatch.setattr(fused, "step", lambda *a: calls.append("step") or compiled(*a))
-    change = r.set_contacts
-    monkeypatch.setattr(r, "set_contacts", lambda s: calls.append("change") or change(s))
-    joined = r.statistics.joined
-    while r.statistics.joined == joined:
+@pytest.mark.parametrize("kernel", KERNELS, ids=["thin plate", "elastic"])
+@pytest.mark.parametrize("shape", [(30, 24), (160, 140)], ids=["mesh", "node per pixel"])
+def test_a_step_is_one_call_of_the_core_whatever_it_changes(kernel, shape):
+    model, calls = counted_model(grid_of(*shape), kernel=kernel)
+    fine = shape[0] * shape[1] > 20_000
+    state, changed = model.rest(), 0
+    for i in range(0, 1500, 20):
+        before = model.native.statistics
         calls.clear()
-        i += 1
-        state = model.advance(state, pose(i), 1e-3)
-    assert calls == ["step", "change", "step"]
+        state = model.advance(state, pose(i), 0.02)
+        # the displacement of a fine mesh is computed when it is asked for
+        assert calls == OF_A_STEP[: 4 if fine else 5]
+        after = model.native.statistics
+        changed += after.joined > before.joined
+    assert changed > 10
 
 
-def test_the_blocks_that_a_step_allocates_do_not_depend_on_mesh_or_contacts():
-    _nrt_python.memsys_enable_stats()
-    counts = set()
-    for shape, steps in (((30, 24), 600), ((30, 24), 1500), ((60, 50), 900)):
-        model, state, i = settled(shape, steps)
-        step(model, state, i)
-        gc.collect()
-        before = rtsys.get_allocation_stats()
-        after = step(model, state, i)
-        now = rtsys.get_allocation_stats()
-        counts.add(now.mi_alloc - before.mi_alloc)
-        assert len(after.mesh) == model.grid.size
-    assert counts == {BLOCKS}
+def test_going_back_to_an_older_state_loads_its_bytes_once():
+    model, calls = counted_model(grid_of(30, 24))
+    first = model.advance(model.rest(), pose(300), 0.1)
+    model.advance(first, pose(320), 0.1)
+    calls.clear()
+    second = model.advance(first, pose(310), 0.1)
+    assert calls == ["echospline_state_load", *OF_A_STEP]
+    calls.clear()
+    model.displacement(second)
+    assert calls == []
+
+
+@pytest.mark.parametrize("kernel", KERNELS, ids=["thin plate", "elastic"])
+@pytest.mark.parametrize("period", [1e-3, 1 / 60], ids=["1 kHz", "60 Hz"])
+@pytest.mark.parametrize("precision", ["single", "double"])
+def test_steps_allocate_nothing_while_contacts_join_and_leave(kernel, period, precision):
+    model = TPSModel(grid_of(40, 30), kernel=kernel, precision=precision)
+    for seed in (1, 3, 4):  # fewer contacts than the core has room for before it is told their number
+        state = model.rest()
+        for p in wandering(seed, period, 8.0):
+            state = model.advance(state, p, period)
+    done = model.native.statistics
+    assert done.joined > 40
+    assert done.left > 20
+    assert done.allocations == 0
+
+
+PROGRAM = r"""
+#include <stdio.h>
+#include <stdlib.h>
+#include "echospline/echospline.h"
+
+/* These stand before the system's: everything that the core asks for passes here. */
+extern void* __libc_malloc(size_t);
+extern void* __libc_calloc(size_t, size_t);
+extern void* __libc_realloc(void*, size_t);
+extern void* __libc_memalign(size_t, size_t);
+static long asked;
+void* malloc(size_t n) { ++asked; return __libc_malloc(n); }
+void* calloc(size_t n, size_t m) { ++asked; return __libc_calloc(n, m); }
+void* realloc(void* p, size_t n) { ++asked; return __libc_realloc(p, n); }
+void* memalign(size_t a, size_t n) { ++asked; return __libc_memalign(a, n); }
+void* aligned_alloc(size_t a, size_t n) { ++asked; return __libc_memalign(a, n); }
+int posix_memalign(void** p, size_t a, size_t n) { ++asked; *p = __libc_memalign(a, n); return *p ? 0 : 12; }
+
+static float field[2 * 200 * 200];
+static unsigned char state[1 << 20];
+
+static int push(int kernel, int width, int depth) {
+  echospline_scene_options options = {.struct_size = sizeof options};
+  echospline_scene_defaults(&options);
+  options.kernel = kernel, options.shape[0] = width, options.shape[1] = depth;
+  options.spacing[0] = 40.0 / (width - 1), options.spacing[1] = 30.0 / (depth - 1);
+  echospline_scene* scene;
+  echospline_tissue* tissue;
+  if (echospline_scene_create(&options, &scene) || echospline_tissue_create(scene, &tissue)) return 1;
+  const long built = asked;
+  echospline_statistics statistics = {.struct_size = sizeof statistics};
+  for (int i = 0; i < 3000; ++i) {
+    const double d = i < 1500 ? 0.018 * i : 0.018 * (3000 - i), v = i < 1500 ? 18 : -18;
+    const echospline_pose pose = {.entry = {12.3, 0}, .tip = {12.3 + 0.4 * d, 0.9165 * d}, .speed = v, .dt = 1e-3};
+    if (echospline_advance(tissue, &pose) || echospline_displacement_single(tissue, field, 2L * width * depth)) return 1;
+    if (i % 100 == 0 && echospline_state_save(tissue, state, sizeof state)) return 1;
+  }
+  if (echospline_tissue_statistics(tissue, &statistics)) return 1;
+  printf("%ld %ld %ld %ld\n", built, asked - built, (long)statistics.joined, (long)statistics.left);
+  echospline_tissue_destroy(tissue);
+  echospline_scene_destroy(scene);
+  asked = 0;
+  return 0;
+}
+
+int main(void) {
+  return push(ECHOSPLINE_THIN_PLATE, 40, 30) || push(ECHOSPLINE_ELASTIC, 40, 30) || push(ECHOSPLINE_THIN_PLATE, 200, 200);
+}
+"""
+
+
+@pytest.mark.skipif(
+    CC is None or not sys.platform.startswith("linux") or os.confstr("CS_GNU_LIBC_VERSION") is None,
+    reason="no C compiler or no GNU C library here: the heap's blocks are not counted",
+)
+def test_steps_ask_the_heap_for_nothing(tmp_path):
+    source, program = tmp_path / "heap.c", tmp_path / "heap"
+    source.write_text(PROGRAM)
+    library = Path(_native.__file__).parent / _native.FILE
+    command = [CC, "-std=c17", "-I", ROOT / "core" / "include", source, library, "-o", program]
+    subprocess.run(command, check=True)
+    environment = {**os.environ, "LD_LIBRARY_PATH": str(library.parent)}
+    run = subprocess.run([program], capture_output=True, text=True, env=environment, check=True)
+    pushes = [tuple(map(int, line.split())) for line in run.stdout.splitlines()]
+    assert len(pushes) == 3
+    for built, during, joined, left in pushes:
+        assert built > 10  # the count works
+        assert joined > 20
+        assert left > 20
+        assert during == 0

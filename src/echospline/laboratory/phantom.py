@@ -12,12 +12,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import isfinite, pi
-from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
-from scipy import fft
+from scipy import fft, sparse
 
 from echospline.errors import InputError
 from echospline.scene import Complexes, Echo, Floats, RegularGrid, Transducer, fourier_frequencies
@@ -315,36 +313,27 @@ def deposit(
     -------
     ndarray, shape (ny, nx), complex64
     """
-    out = np.zeros(grid.shape[::-1], dtype=np.complex64)
-    _deposit(
-        np.ascontiguousarray(points),
-        np.ascontiguousarray(amplitudes),
-        np.asarray(grid.origin),
-        np.asarray(grid.spacing),
-        np.asarray(wave),
-        out,
-    )
+    nx, ny = grid.shape
+    gx, gy = (points - grid.origin).T / np.reshape(grid.spacing, (2, 1))
+    inside = (gx >= 0.0) & (gy >= 0.0) & (gx < nx - 1) & (gy < ny - 1)
+    if not inside.all():
+        points, amplitudes, gx, gy = points[inside], amplitudes[inside], gx[inside], gy[inside]
+    n = len(points)
+    ix, iy = gx.astype(np.int32), gy.astype(np.int32)
+    # single precision from here on: positions in a cell, and angles without their whole turns
+    fx, fy = (gx - ix).astype(np.float32), (gy - iy).astype(np.float32)
+    turns = wave[0] * points[:, 0] + wave[1] * points[:, 1]
+    angle = (2.0 * pi * (turns - np.rint(turns))).astype(np.float32)
+    a = amplitudes.astype(np.float32)
+    echoes = np.column_stack([a * np.cos(angle), -a * np.sin(angle)])
+    first = iy * nx + ix
+    corners = np.column_stack([first, first + 1, first + nx, first + nx + 1])
+    shares = np.column_stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy])
+    # a column for each point, with its four shares
+    starts = np.arange(0, 4 * n + 1, 4, dtype=np.int32)
+    bilinear = sparse.csc_array((shares.ravel(), corners.ravel(), starts), shape=(nx * ny, n))
+    out: Complexes = (bilinear @ echoes).view(np.complex64).reshape(ny, nx)
     return out
-
-
-@njit(cache=True, nogil=True)
-def _deposit(points: Any, amplitudes: Any, origin: Any, spacing: Any, wave: Any, out: Any) -> None:
-    ny, nx = out.shape
-    for i in range(len(points)):
-        x, y = points[i, 0], points[i, 1]
-        gx, gy = (x - origin[0]) / spacing[0], (y - origin[1]) / spacing[1]
-        if not (gx >= 0.0 and gy >= 0.0 and gx < nx - 1 and gy < ny - 1):
-            continue
-        ix, iy = int(gx), int(gy)
-        fx, fy = gx - ix, gy - iy
-        # whole turns are removed first: the cosine of a small angle is faster
-        turns = wave[0] * x + wave[1] * y
-        angle = 2.0 * pi * (turns - np.floor(turns))
-        re, im = amplitudes[i] * np.cos(angle), -amplitudes[i] * np.sin(angle)
-        out[iy, ix] += (1 - fx) * (1 - fy) * complex(re, im)
-        out[iy, ix + 1] += fx * (1 - fy) * complex(re, im)
-        out[iy + 1, ix] += (1 - fx) * fy * complex(re, im)
-        out[iy + 1, ix + 1] += fx * fy * complex(re, im)
 
 
 def _inside(small: RegularGrid, large: RegularGrid) -> tuple[slice, slice]:

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from math import exp, hypot
 from typing import Any
 
 import numpy as np
 
 from echospline.live.snapshot import Command
+from echospline.mechanics.motion import follow as towards
 from echospline.mechanics.protocol import TissueModel
-from echospline.scene import ZERO_LENGTH, NeedlePose
-
-ARRIVED = 1e-4
-"""mm; a needle this near to its goal is put exactly there."""
+from echospline.scene import NeedlePose
 
 
 def follow(pose: NeedlePose, command: Command, dt: float, lag: float, fastest: float) -> NeedlePose:
@@ -39,28 +35,13 @@ def follow(pose: NeedlePose, command: Command, dt: float, lag: float, fastest: f
     -------
     NeedlePose
         After the step; its speed is the axial speed of the tip relative to the entry, mm/s.
+
+    Raises
+    ------
+    InputError
+        If a number is out of its range or not finite.
     """
-    share = 1.0 - exp(-dt / lag) if lag > 0 else 1.0
-    entry = _towards(pose.entry, command.entry, share, fastest * dt)
-    tip = _towards(pose.tip, command.tip, share, fastest * dt)
-    moved = NeedlePose(entry, tip)
-    axis = moved.axis if moved.depth > ZERO_LENGTH else pose.axis
-    along = (
-        (tip[0] - entry[0]) - (pose.tip[0] - pose.entry[0]),
-        (tip[1] - entry[1]) - (pose.tip[1] - pose.entry[1]),
-    )
-    return replace(moved, speed=(along[0] * axis[0] + along[1] * axis[1]) / dt)
-
-
-def _towards(
-    start: tuple[float, float], goal: tuple[float, float], share: float, longest: float
-) -> tuple[float, float]:
-    dx, dy = goal[0] - start[0], goal[1] - start[1]
-    distance = hypot(dx, dy)
-    step = min(share * distance, longest)
-    if distance - step < ARRIVED:
-        return goal
-    return (start[0] + dx * step / distance, start[1] + dy * step / distance)
+    return towards(pose, command.entry, command.tip, dt, lag, fastest)
 
 
 def insert_straight(

@@ -7,6 +7,7 @@ from echospline.mechanics.green import GreenModel
 from echospline.mechanics.kernels import Elastic, Kernel, ThinPlate
 from echospline.mechanics.landmark_stiffness import landmark_stiffness
 from echospline.mechanics.landmarks import Clamps
+from echospline.mechanics.native import describe_core
 from echospline.mechanics.parameters import TPSParameters
 from echospline.mechanics.protocol import TissueModel
 from echospline.mechanics.tps import Solver, TPSModel
@@ -24,5 +25,6 @@ __all__ = [
     "TPSParameters",
     "ThinPlate",
     "TissueModel",
+    "describe_core",
     "landmark_stiffness",
 ]

@@ -10,15 +10,15 @@ import ctypes
 import itertools
 import threading
 import weakref
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from math import isfinite
+from time import perf_counter
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from echospline import _native as core
-from echospline.errors import InputError
 from echospline.mechanics.kernels import Elastic, Kernel
 from echospline.mechanics.landmarks import Clamps
 from echospline.mechanics.parameters import TPSParameters
@@ -81,6 +81,19 @@ class Statistics:
     residual: float
 
 
+def describe_core() -> dict[str, str]:
+    """Return the version of the native core, and the processor level that it uses here."""
+    library = core.library()
+    number = library.echospline_version()
+    version = f"{number >> 16}.{number >> 8 & 255}.{number & 255}"
+    return {"version": version, "level": _level_name(library.echospline_level_best())}
+
+
+def _level_name(level: int) -> str:
+    name: bytes = core.library().echospline_level_name(level)
+    return name.decode()
+
+
 class NativeStep:
     """Steps of one scene in the core, for any state, from any thread.
 
@@ -137,8 +150,7 @@ class NativeStep:
     @property
     def level(self) -> str:
         """Name of the processor level in use."""
-        name: bytes = self._core.echospline_level_name(self._core.echospline_scene_level(self._scene))
-        return name.decode()
+        return _level_name(self._core.echospline_scene_level(self._scene))
 
     @property
     def statistics(self) -> Statistics:
@@ -156,10 +168,7 @@ class NativeStep:
         """State after the needle has moved to ``pose`` in ``dt`` seconds, equations (12) to (17)."""
         with self._lock:
             self._go_to(state)
-            p = self._pose
-            p.entry[0], p.entry[1] = pose.entry
-            p.tip[0], p.tip[1] = pose.tip
-            p.speed, p.dt = pose.speed, dt
+            self._set(pose, dt)
             status = self._core.echospline_advance(self._tissue, self._at_pose)
             if status != core.Status.OK:
                 self._current = 0
@@ -204,6 +213,41 @@ class NativeStep:
             tip=tip,
             held_back=state.held_back,
         )
+
+    def time_steps(self, poses: Sequence[NeedlePose], dt: float) -> tuple[Floats, NDArray[np.bool_]]:
+        """Time the core alone on a path from rest: the step, and the mesh displacement in single precision.
+
+        Returns
+        -------
+        seconds : ndarray, shape (k,)
+            Of each step.
+        changed : ndarray of bool, shape (k,)
+            Whether contacts joined or left in it.
+        """
+        seconds, changes = np.empty(len(poses)), np.zeros(len(poses) + 1, dtype=np.int64)
+        mesh = np.empty((self._size, 2), dtype=np.float32)
+        advance, displacement = self._core.echospline_advance, self._core.echospline_displacement_single
+        tissue, at_pose, at_mesh, numbers = self._tissue, self._at_pose, mesh.ctypes.data, mesh.size
+        with self._lock:
+            self._current = 0
+            self._check(self._core.echospline_tissue_reset(tissue))
+            self._ask_statistics()
+            changes[0] = self._statistics.joined + self._statistics.left
+            for i, pose in enumerate(poses):
+                self._set(pose, dt)
+                begin = perf_counter()
+                status = advance(tissue, at_pose) or displacement(tissue, at_mesh, numbers)
+                seconds[i] = perf_counter() - begin
+                self._check(status)
+                self._ask_statistics()
+                changes[i + 1] = self._statistics.joined + self._statistics.left
+        return seconds, np.diff(changes) > 0
+
+    def _set(self, pose: NeedlePose, dt: float) -> None:
+        p = self._pose
+        p.entry[0], p.entry[1] = pose.entry
+        p.tip[0], p.tip[1] = pose.tip
+        p.speed, p.dt = pose.speed, dt
 
     def _go_to(self, state: NativeState) -> None:
         if state.number != self._current:
@@ -261,46 +305,3 @@ def edge_bits(edges: Iterable[str]) -> int:
 def _destroy(library: Any, scene: ctypes.c_void_p, tissue: ctypes.c_void_p) -> None:
     library.echospline_tissue_destroy(tissue)
     library.echospline_scene_destroy(scene)
-
-
-def follow_command(
-    pose: NeedlePose,
-    entry: tuple[float, float],
-    tip: tuple[float, float],
-    dt: float,
-    lag: float,
-    fastest: float,
-) -> NeedlePose:
-    """Move a needle one step towards where it is commanded, as the core does for every host.
-
-    Parameters
-    ----------
-    pose : NeedlePose
-        Before the step.
-    entry, tip : (x, y)
-        Where the needle shall go, mm.
-    dt : float
-        Length of the step, s, positive.
-    lag : float
-        Time constant with which it follows, s; 0: at once.
-    fastest : float
-        Upper limit of the speed of tip and entry, mm/s.
-
-    Returns
-    -------
-    NeedlePose
-        After the step; its speed is the axial speed of the tip relative to the entry, mm/s.
-    """
-    now, after = core.Pose(entry=(*pose.entry, 0.0), tip=(*pose.tip, 0.0)), core.Pose(dt=dt)
-    command = core.Command((*entry, 0.0), (*tip, 0.0), lag, fastest)
-    status = core.library().echospline_follow(ctypes.byref(now), ctypes.byref(command), ctypes.byref(after))
-    if status != core.Status.OK:
-        raise InputError(
-            "a needle follows finite positions in mm, in steps of a positive dt, with a lag of zero or more and a positive "
-            f"fastest speed; got entry {entry}, tip {tip}, dt {dt} s, lag {lag} s, fastest {fastest} mm/s"
-        )
-    x, y, _ = after.entry
-    u, v, _ = after.tip
-    if not (isfinite(x) and isfinite(u)):
-        raise InputError(f"the needle left every range: command entry {entry}, tip {tip} mm")
-    return NeedlePose((x, y), (u, v), after.speed)

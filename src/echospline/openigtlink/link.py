@@ -9,7 +9,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from echospline.errors import InputError
-from echospline.openigtlink.crc64 import warm_up
 from echospline.openigtlink.message import READABLE, Message, Request
 from echospline.openigtlink.peer import Key, Outgoing, Patience, Peer
 from echospline.openigtlink.text import NOT_FOUND, Capability, Status
@@ -134,7 +133,6 @@ class Link:
 
     def _begin(self) -> None:
         if not self._tasks:
-            warm_up()
             self._tasks.append(asyncio.get_running_loop().create_task(self._watch()))
 
     def _peer(self) -> Peer:

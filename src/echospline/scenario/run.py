@@ -20,6 +20,7 @@ from echospline.atomic import give_name, part_of
 from echospline.errors import InputError
 from echospline.io import DisplacementWriter, open_writer
 from echospline.io.sequence import SequenceWriter
+from echospline.mechanics import describe_core
 from echospline.mechanics.protocol import State, TissueModel
 from echospline.picture import Frame, ImageFormer, frame_count, simulate
 from echospline.scenario.scenario import Scenario
@@ -29,7 +30,7 @@ SUFFIX = {
     "mp4": "cine.mp4", "gif": "cine.gif", "png": "frames", "mha": "cine.mha",
     "igs.mha": "run.igs.mha", "seq.nrrd": "run.seq.nrrd",
 }  # fmt: skip
-REPORTED_PACKAGES = ("echospline", "numpy", "scipy", "numba", "opencv-python-headless", "scikit-fem", "av")
+REPORTED_PACKAGES = ("echospline", "numpy", "scipy", "opencv-python-headless", "scikit-fem", "av")
 """Packages whose versions are in a report."""
 
 
@@ -185,6 +186,7 @@ def run(
         "seconds": perf_counter() - began,
         "files": [*files, "scenario.toml", "run.json"],
         "versions": {"python": platform.python_version(), "platform": platform.platform(), **_versions()},
+        "core": describe_core(),
         "parameters": scenario.model_dump(mode="json"),
     }
     part = part_of(out / "run.json")

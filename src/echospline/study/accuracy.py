@@ -275,7 +275,7 @@ def brute_force(*, runs: int, frames: int, nodes: Sequence[int], seed: int = 0) 
     grid = case.grid
     seen = observe(FEMModel(grid, CLAMPED, case.tissue, case.forces), *case.poses(FITTED))
     model = TPSModel(grid, CLAMPED, PRINTED)
-    identify(SplineFields(model, seen.frames(np.array([frames]))), bootstrap=0)  # compiled before it is timed
+    identify(SplineFields(model, seen.frames(np.array([frames]))), bootstrap=0)  # fills caches
     began = thread_time()
     closed = identify(SplineFields(model, seen), "mae", seed=seed, bootstrap=0)
     closed_seconds = thread_time() - began  # unit fields included
@@ -298,7 +298,7 @@ def brute_force(*, runs: int, frames: int, nodes: Sequence[int], seed: int = 0) 
     grid_found = grid_search(simulate, axes, seen.displacement)
     per_run = (thread_time() - began) / grid_found.runs
     some = [{"sigma": s, "alpha1": axes["alpha1"][1], "alpha2": axes["alpha2"][1]} for s in axes["sigma"]]
-    simulate(some[0], "response")  # compiled before it is timed
+    simulate(some[0], "response")  # fills caches
     began = thread_time()
     for values in some:
         simulate(values, "response")

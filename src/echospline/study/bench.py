@@ -1,25 +1,32 @@
-"""Time of a step on this machine, against the bare product that is its limit, the display's 60 Hz and the haptic 1 kHz."""
+"""Time of a step and of a frame on this machine, against the limit of each, the display's 60 Hz and the haptic 1 kHz."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from time import perf_counter
+from typing import Any
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from echospline.errors import InputError
 from echospline.mechanics import Elastic, Kernel, ThinPlate, TPSModel, TPSParameters
-from echospline.mechanics.fused import FusedStep
-from echospline.mechanics.response import Statistics
-from echospline.picture import Deformation, warp
+from echospline.mechanics.native import NativeStep
+from echospline.mechanics.tps import State
+from echospline.picture import Deformation, NeedleEcho, draw_needle, warp
 from echospline.scene import Floats, NeedlePose, RegularGrid, UltrasoundImage
 
 MESHES = {1200: (40, 30), 4524: (78, 58)}
 """Nodes of the meshes measured, on 40 x 30 mm."""
 
-PERIOD, SPEED = 1e-3, 10.0
+PERIODS = {"1 kHz": 1e-3, "60 Hz": 1 / 60}
+"""s; haptic devices and displays."""
+PERIOD, SPEED = PERIODS["1 kHz"], 10.0
 """s and mm/s: a haptic rate, a brisk push."""
+PIXELS = 512
+"""Columns and rows of the frames."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +42,12 @@ class Row:
     median_ms, p99_ms : float
         Of one step or frame.
     limit_ms : float
-        Median of the bare float32 product of landmarks and mesh, two components, in its best layout.
+        Median of the limit: for a step the bare float32 product of landmarks and mesh, two components, in its best layout; for a frame
+        `cv2.remap` of the same picture.
     ratio_to_limit : float
         median_ms / limit_ms.
+    level : str
+        Processor level that the core uses.
     """
 
     name: str
@@ -47,6 +57,7 @@ class Row:
     p99_ms: float
     limit_ms: float
     ratio_to_limit: float
+    level: str
 
     def as_json(self) -> dict[str, str | int | float]:
         """Return the row as values for JSON."""
@@ -67,54 +78,63 @@ def path(period: float = PERIOD, depth: float = 26.0) -> Iterator[NeedlePose]:
         yield NeedlePose((12.3, 0.0), (float(tip[0]), float(tip[1])), SPEED)
 
 
-def time_steps(
-    model: TPSModel, poses: list[NeedlePose], period: float = PERIOD
-) -> tuple[Floats, list[str], int]:
-    """Time every step of a push, from pose to mesh displacement.
+def native(model: TPSModel) -> NativeStep:
+    """Return the core's step of a model; one that refits has none."""
+    if model.native is None:
+        raise InputError('only the solver "response" is measured here')
+    return model.native
+
+
+def time_steps(model: TPSModel, poses: list[NeedlePose], period: float = PERIOD) -> tuple[Floats, int]:
+    """Time every step of a push as a program in Python makes it, from pose to mesh displacement.
 
     Returns
     -------
-    milliseconds : ndarray, shape (k,)
-    kinds : list of str, length k
-        "contacts change"; "patch": none changes, but the tip's next patch is begun or a row of it built, or the tip's
-        row evaluated; or "plain".
+    seconds : ndarray, shape (k,)
     landmarks : int
         Moving landmarks after the last step.
     """
-    if model.fast is None:
-        raise InputError('only the solver "response" is measured here')
-    statistics = model.fast.response.statistics
-    state, times, kinds = model.rest(), [], []
-    for pose in poses:
-        changes, before = statistics.joined + statistics.left, _work(statistics)
+    state, seconds = model.rest(), np.empty(len(poses))
+    for i, pose in enumerate(poses):
         begin = perf_counter()
         state = model.advance(state, pose, period)
         model.displacement(state)
-        times.append(perf_counter() - begin)
-        if statistics.joined + statistics.left > changes:
-            kinds.append("contacts change")
-        else:
-            kinds.append("patch" if _work(statistics) > before else "plain")
-    return 1000.0 * np.array(times), kinds, model.fast.response.count + 1
+        seconds[i] = perf_counter() - begin
+    return seconds, moving(model, state)
 
 
-def _work(statistics: Statistics) -> int:
-    """Count the work done for the tip's column so far."""
-    return statistics.patches + statistics.built + statistics.direct
+def moving(model: TPSModel, state: State) -> int:
+    """Return the number of landmarks that move: contacts and tip."""
+    found = model.landmarks(state)
+    return len(found.contacts) + (found.tip is not None)
 
 
-def bare_product(step: FusedStep, repeats: int = 400) -> float:
-    """Return the median time in ms of the float32 product of the contacts' displacements and their rows: the lower limit of a step."""
-    r, c = step.response, step.response.scene.components
-    rows = r.single[r.head : r.head + r.count * c]
-    weights = np.ones((2 // c, len(rows)), dtype=np.float32)
+def bare_product(nodes: int, landmarks: int, components: int = 1, repeats: int = 400) -> float:
+    """Return the median seconds of the float32 product of weights and rows: one read of the response, the lower limit of a step.
+
+    Parameters
+    ----------
+    nodes, landmarks : int
+        Of the mesh; that move.
+    components : {1, 2}
+        Displacement components that one weight moves: 1 for a thin plate, whose rows serve both, 2 for an elastic kernel.
+    repeats : int
+        Number of products timed.
+    """
+    rows = np.random.default_rng(0).random((landmarks * components, nodes * components), dtype=np.float32)
+    weights = np.ones((2 // components, len(rows)), dtype=np.float32)
     out = np.empty((len(weights), rows.shape[1]), dtype=np.float32)
-    times = np.empty(repeats)
+    return median_time(lambda: np.dot(weights, rows, out=out), repeats)
+
+
+def median_time(call: Callable[[], object], repeats: int) -> float:
+    """Return the median time of a call, s."""
+    seconds = np.empty(repeats)
     for i in range(repeats):
         begin = perf_counter()
-        np.dot(weights, rows, out=out)
-        times[i] = perf_counter() - begin
-    return 1000.0 * float(np.median(times))
+        call()
+        seconds[i] = perf_counter() - begin
+    return float(np.median(seconds))
 
 
 def benchmark(report: Callable[[str], None] = lambda _: None) -> list[Row]:
@@ -131,45 +151,74 @@ def benchmark(report: Callable[[str], None] = lambda _: None) -> list[Row]:
         for shape in MESHES.values():
             report(f"{name}steps, {shape[0]} x {shape[1]} nodes")
             rows += _steps(name, shape, kernel)
-    report("frames of 512 x 512 pixels")
-    rows.append(_frames(MESHES[4524]))
+    for shape in MESHES.values():
+        report(f"frames of {PIXELS} x {PIXELS} pixels, {shape[0]} x {shape[1]} nodes")
+        rows += _frames(shape)
     return rows
 
 
 def _steps(name: str, shape: tuple[int, int], kernel: Kernel) -> list[Row]:
     model = scene(shape, kernel)
-    times, kinds, landmarks = time_steps(model, list(path()))
-    limit = bare_product(_fast(model))
-    late = np.arange(len(times)) > len(times) * 3 // 4  # nearly all contacts are there
-    kind = np.array(kinds)
-    parts = {
-        f"{name}step": late & (kind != "contacts change"),
-        f"{name}contact change": late & (kind == "contacts change"),
-        f"{name}all steps": late,
-    }
-    return [_row(label, shape, landmarks, times[mask], limit) for label, mask in parts.items()]
+    step, poses = native(model), {rate: list(path(period)) for rate, period in PERIODS.items()}
+    in_python, landmarks = time_steps(model, poses["1 kHz"])
+    limit = bare_product(shape[0] * shape[1], landmarks, 2 if isinstance(kernel, Elastic) else 1)
+    parts = {}
+    for rate, period in PERIODS.items():
+        seconds, changed = step.time_steps(poses[rate], period)
+        parts[f"{name}step at {rate}"] = _late(seconds)
+        if rate == "1 kHz":
+            parts[f"{name}contact change"] = _late(seconds)[_late(changed)]
+    parts[f"{name}step from Python"] = _late(in_python)
+    return [_row(label, shape, landmarks, times, limit, step.level) for label, times in parts.items()]
 
 
-def _frames(shape: tuple[int, int]) -> Row:
-    model, size, fps = scene(shape), 512, 60.0
-    grid = RegularGrid((size, size), (40.0 / (size - 1), 30.0 / (size - 1)))
-    pixels = np.random.default_rng(0).integers(0, 255, (size, size), dtype=np.uint8)
-    image, state, times = UltrasoundImage(pixels, grid), model.rest(), []
-    for pose in path(1 / fps):
-        begin = perf_counter()
-        state = model.advance(state, pose, 1 / fps)
-        warp(image, Deformation(model.grid, model.displacement(state)).inverse(grid))
-        times.append(perf_counter() - begin)
-    late = 1000.0 * np.array(times[len(times) // 4 :])
-    return _row("frame", shape, _fast(model).response.count + 1, late, bare_product(_fast(model)))
+def _frames(shape: tuple[int, int]) -> list[Row]:
+    """Time whole frames at 60 Hz, from pose to picture, and cv2.remap between them."""
+    model, period = scene(shape), PERIODS["60 Hz"]
+    grid = RegularGrid((PIXELS, PIXELS), (40.0 / (PIXELS - 1), 30.0 / (PIXELS - 1)))
+    noise = np.random.default_rng(0).integers(0, 255, (PIXELS, PIXELS), dtype=np.uint8)
+    image = UltrasoundImage(noise, grid)
+    rows = []
+    for name, draw in drawings(model, image).items():
+        state, frames, remaps = model.rest(), [], []
+        for pose in path(period):
+            begin = perf_counter()
+            state = model.advance(state, pose, period)
+            draw(model.displacement(state), pose)
+            frames.append(perf_counter() - begin)
+            found = Deformation(model.grid, model.displacement(state)).inverse(grid)
+            begin = perf_counter()
+            cv2.remap(noise, found.x, found.y, cv2.INTER_LINEAR)
+            remaps.append(perf_counter() - begin)
+        limit = float(np.median(remaps))
+        rows.append(
+            _row(name, shape, moving(model, state), _late(np.array(frames)), limit, native(model).level)
+        )
+    return rows
 
 
-def _row(name: str, shape: tuple[int, int], landmarks: int, times: Floats, limit: float) -> Row:
-    median, p99 = np.quantile(times, [0.5, 0.99])
-    return Row(name, shape[0] * shape[1], landmarks, float(median), float(p99), limit, float(median) / limit)
+Draw = Callable[[Floats, NeedlePose], object]
+"""Displacement of the mesh nodes and the needle's pose -> the picture."""
 
 
-def _fast(model: TPSModel) -> FusedStep:
-    if model.fast is None:
-        raise InputError('only the solver "response" is measured here')
-    return model.fast
+def drawings(model: TPSModel, image: UltrasoundImage) -> dict[str, Draw]:
+    """Return the ways to draw a frame, by the names of their rows."""
+    echo = NeedleEcho()
+
+    def exact(displacement: Floats, pose: NeedlePose) -> UltrasoundImage:
+        warped = warp(image, Deformation(model.grid, displacement).inverse(image.grid))
+        return draw_needle(warped, pose, echo)
+
+    return {"frame": exact}
+
+
+def _late(values: NDArray[Any]) -> NDArray[Any]:
+    """Return the last quarter, where nearly all contacts are there."""
+    return values[len(values) * 3 // 4 :]
+
+
+def _row(name: str, shape: tuple[int, int], landmarks: int, seconds: Floats, limit: float, level: str) -> Row:
+    median, p99 = (1000.0 * float(q) for q in np.quantile(seconds, [0.5, 0.99]))
+    return Row(
+        name, shape[0] * shape[1], landmarks, median, p99, 1000.0 * limit, median / (1000.0 * limit), level
+    )

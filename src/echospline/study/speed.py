@@ -29,8 +29,8 @@ from echospline.mechanics import (
 )
 from echospline.mechanics.finite_elements import Method as Factorisation
 from echospline.mechanics.finite_elements import factor, stiffness
+from echospline.mechanics.native import Precision
 from echospline.mechanics.protocol import TissueModel
-from echospline.mechanics.response import Precision
 from echospline.scene import Floats, Insertion, NeedlePose, RegularGrid
 from echospline.study.accuracy import CLAMPED, FITTED, SIZE, SPEED
 
@@ -208,7 +208,7 @@ def _timed(method: Method, grid: RegularGrid, poses: Sequence[NeedlePose], secon
     began = perf_counter()
     step = method.build(grid, poses)
     setup = perf_counter() - began
-    # One whole insertion warms caches and compilers up, if it is quick; then insertion after insertion.
+    # One whole insertion warms caches up, if it is quick; then insertion after insertion.
     began = perf_counter()
     for pose in poses:
         step(pose)

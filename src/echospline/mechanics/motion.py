@@ -1,0 +1,53 @@
+"""Motion of a needle that follows its command, as the native core moves it for every host."""
+
+from __future__ import annotations
+
+import ctypes
+
+from echospline import _native as core
+from echospline.errors import InputError
+from echospline.scene import NeedlePose
+
+
+def follow(
+    pose: NeedlePose,
+    entry: tuple[float, float],
+    tip: tuple[float, float],
+    dt: float,
+    lag: float,
+    fastest: float,
+) -> NeedlePose:
+    """Move a needle one step towards its command.
+
+    Parameters
+    ----------
+    pose : NeedlePose
+        Before the step.
+    entry, tip : (x, y)
+        Where the needle shall go, mm.
+    dt : float
+        Length of the step, s, positive.
+    lag : float
+        Time constant with which it follows, s; 0: at once.
+    fastest : float
+        Upper limit of the speed of tip and entry, mm/s, positive.
+
+    Returns
+    -------
+    NeedlePose
+        After the step; its speed is the axial speed of the tip relative to the entry, mm/s.
+
+    Raises
+    ------
+    InputError
+        If a number is out of its range or not finite.
+    """
+    now, after = core.Pose(entry=(*pose.entry, 0.0), tip=(*pose.tip, 0.0)), core.Pose(dt=dt)
+    command = core.Command((*entry, 0.0), (*tip, 0.0), lag, fastest)
+    status = core.library().echospline_follow(ctypes.byref(now), ctypes.byref(command), ctypes.byref(after))
+    if status != core.Status.OK:
+        raise InputError(
+            "a needle follows finite positions in mm, in steps of a positive dt, with a lag of zero or more and a positive "
+            f"fastest speed; got entry {entry}, tip {tip}, dt {dt} s, lag {lag} s, fastest {fastest} mm/s"
+        )
+    return NeedlePose((after.entry[0], after.entry[1]), (after.tip[0], after.tip[1]), after.speed)
