@@ -222,9 +222,10 @@ class Tissue {
   Outcome touch(const Needle<D>& n) {
     const Interaction& p = scene.interaction;
     const int64_t touched = find_touched(n);
-    if (touched + state.count > response_.room) {
+    const int64_t most = together(touched);
+    if (most > response_.room) {
       next_count_ = 0;
-      if (!grow(touched + state.count)) return no_memory;
+      if (!grow(most)) return no_memory;
     }
     int64_t rows = 0, i = 0, j = 0;
     while (i < touched || j < state.count) {
@@ -250,6 +251,16 @@ class Tissue {
     }
     next_count_ = rows;
     return done;
+  }
+
+  /// Number of sources that are touched, are contacts already, or both.
+  int64_t together(int64_t touched) const {
+    int64_t count = touched, i = 0;
+    for (int64_t j = 0; j < state.count; ++j) {
+      while (i < touched && touched_[i] < state.contacts[j].source) ++i;
+      if (i == touched || touched_[i] != state.contacts[j].source) ++count;
+    }
+    return count;
   }
 
   /// Sources within delta of the shaft, equation (13), ascending; their number.

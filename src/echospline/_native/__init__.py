@@ -1,6 +1,6 @@
 """The native core and its one binding: the C interface of core/include/echospline/echospline.h by ctypes, and nothing else.
 
-Nothing is loaded at import; `library()` loads once. Every call releases the interpreter lock. Structs, enums and functions have
+Nothing is loaded at import; `library()` loads once. Calls release the interpreter lock, but for the shortest. Structs, enums and functions have
 the header's names without the prefix, no defaults and no logic; arrays are passed as addresses. Tests hold all of it to the header.
 """
 
@@ -338,6 +338,15 @@ FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {  # name: result, arguments; hand
 }
 
 
+SHORT = (  # calls of a microsecond: to release the interpreter lock and fetch it again would cost more than they do
+    "echospline_state_size",
+    "echospline_state_save",
+    "echospline_tissue_statistics",
+    "echospline_displacement",
+    "echospline_follow",
+)
+
+
 class CoreError(ImportError):
     """The core's library is missing, or is another version's; the message says what to do."""
 
@@ -360,9 +369,11 @@ def load(path: Path) -> ctypes.CDLL:
         raise CoreError(
             f"expected version {expected} of the core's library {path}; got {came}; run: pip install ."
         )
+    keeping_the_lock = ctypes.PyDLL(str(path))
     for name, (result, arguments) in FUNCTIONS.items():
-        function = getattr(found, name)
+        function = getattr(keeping_the_lock if name in SHORT else found, name)
         function.restype, function.argtypes = result, arguments
+        setattr(found, name, function)
     return found
 
 
