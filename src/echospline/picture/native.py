@@ -28,6 +28,8 @@ PIXEL_TYPES = {
     np.dtype(np.float32): core.PixelType.FLOAT32,
 }
 """Types of pixels that the core samples."""
+LARGEST = 1e6
+"""Grey level beyond which the core takes no border and no white."""
 INTERPOLATIONS = {"linear": core.Interpolation.LINEAR, "nearest": core.Interpolation.NEAREST}
 METHODS = {"auto": core.Method.METHOD_AUTO, "exact": core.Method.METHOD_EXACT}
 
