@@ -50,7 +50,7 @@ def test_a_run_leaves_everything_it_names(done):
     assert json.loads((out / "run.json").read_text()) == report
     assert report["parameters"]["needle"]["depth"] == 6.0
     assert set(report["milliseconds_per_frame"]) == {
-        "interaction", "spline", "inverse map", "warp", "needle", "write",
+        "interaction", "spline", "picture", "write",
     }  # fmt: skip
 
 
