@@ -8,6 +8,7 @@
 
 #include "../include/echospline/echospline.h"
 #include "picture_entries.hpp"
+#include "tissue_entries.hpp"
 
 struct echospline_picture {
   const echospline::Level* level;
@@ -145,6 +146,34 @@ echospline_status null_argument(echospline_picture* picture, const char* name) {
   return refuse(picture->message, ECHOSPLINE_NULL_POINTER, "%s must not be NULL", name);
 }
 
+/// Has the picture the tissue's mesh?
+echospline_status check_mesh(echospline_picture* picture, const echospline::FieldPlanes& planes) {
+  const echospline_picture_options& o = picture->options;
+  for (int d = 0; d < 2; ++d) {
+    const double rounding = 1e-6 * planes.spacing[d];
+    if (o.mesh_shape[d] != planes.shape[d] || !(std::fabs(o.mesh_spacing[d] - planes.spacing[d]) <= rounding) ||
+        !(std::fabs(o.mesh_origin[d] - planes.origin[d]) <= rounding))
+      return refuse(picture->message, ECHOSPLINE_WRONG_SIZE,
+                    "the picture's mesh must be the tissue's, %d x %d nodes of %g x %g mm from (%g, %g); got %d x %d of %g x %g "
+                    "from (%g, %g)",
+                    planes.shape[0], planes.shape[1], planes.spacing[0], planes.spacing[1], planes.origin[0],
+                    planes.origin[1], o.mesh_shape[0], o.mesh_shape[1], o.mesh_spacing[0], o.mesh_spacing[1],
+                    o.mesh_origin[0], o.mesh_origin[1]);
+  }
+  return ECHOSPLINE_OK;
+}
+
+/// Are all displacements of a tissue near enough to be drawn?
+template <class Real>
+echospline_status check_planes(echospline_picture* picture, const Real* x, const Real* y, int64_t nodes) {
+  for (int64_t k = 0; k < nodes; ++k)
+    if (!near_enough(x[k]) || !near_enough(y[k]))
+      return refuse(picture->message, ECHOSPLINE_WRONG_VALUE,
+                    "the tissue's displacement must be below %g mm to be drawn; node %lld has (%g, %g)", FURTHEST,
+                    static_cast<long long>(k), static_cast<double>(x[k]), static_cast<double>(y[k]));
+  return ECHOSPLINE_OK;
+}
+
 template <class Real>
 echospline_status check_displacement(echospline_picture* picture, const Real* displacement, int64_t count) {
   if (const echospline_status status = check_handle(picture)) return status;
@@ -270,6 +299,24 @@ echospline_status echospline_picture_deform_single(echospline_picture* picture, 
                                                    int64_t count) {
   if (const echospline_status status = check_displacement(picture, displacement, count)) return status;
   picture->level->picture->deform_single(picture->picture, displacement);
+  return ECHOSPLINE_OK;
+}
+
+echospline_status echospline_picture_follow(echospline_picture* picture, echospline_tissue* tissue) {
+  if (const echospline_status status = check_handle(picture)) return status;
+  echospline::FieldPlanes planes;
+  if (const echospline_status status = echospline::planes_of(tissue, planes, picture->message)) return status;
+  if (const echospline_status status = check_mesh(picture, planes)) return status;
+  const int64_t nodes = int64_t(planes.shape[0]) * planes.shape[1];
+  const echospline::PictureEntries& call = *picture->level->picture;
+  if (planes.exact[0]) {
+    if (const echospline_status status = check_planes(picture, planes.exact[0], planes.exact[1], nodes)) return status;
+    call.deform_planes_double(picture->picture, planes.exact[0], planes.exact[1]);
+  } else {
+    if (const echospline_status status = check_planes(picture, planes.single[0], planes.single[1], nodes))
+      return status;
+    call.deform_planes(picture->picture, planes.single[0], planes.single[1]);
+  }
   return ECHOSPLINE_OK;
 }
 

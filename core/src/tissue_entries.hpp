@@ -9,6 +9,14 @@ struct SceneCounts {
   int64_t nodes, anchors, sources;
 };
 
+/// Displacement of a plane mesh as a tissue keeps it, mm: one plane of numbers per component, in one of two precisions.
+struct FieldPlanes {
+  const float* single[2];
+  const double* exact[2];  // nullptr where the field is in single precision
+  int32_t shape[2];
+  double spacing[2], origin[2];
+};
+
 /// Functions of one kind of tissue: dimension, kernel and precision.
 struct TissueFunctions {
   void (*destroy)(void* tissue);
@@ -17,6 +25,7 @@ struct TissueFunctions {
   echospline_status (*displacement)(void* tissue, double* out);
   echospline_status (*displacement_single)(void* tissue, float* out);
   echospline_status (*displacement_at)(void* tissue, const double* points, int64_t count, double* out);
+  echospline_status (*planes)(void* tissue, FieldPlanes& out);  // of a tissue in the plane
   int64_t (*landmarks)(void* tissue, echospline_landmark* out, int64_t room);
   void (*statistics)(void* tissue, echospline_statistics& out);
   int64_t (*state_size)(const void* tissue);
@@ -39,5 +48,8 @@ struct TissueEntries {
                                     Message& message);
   echospline_status (*follow)(const echospline_pose& now, const echospline_command& command, echospline_pose& next);
 };
+
+/// Field of a tissue for a picture; `message` says why there is none.
+echospline_status planes_of(echospline_tissue* tissue, FieldPlanes& planes, Message& message);
 
 }  // namespace echospline

@@ -107,6 +107,24 @@ struct Kind {
         }));
   }
 
+  static echospline_status planes(void* t, FieldPlanes& out) {
+    if constexpr (D == 2) {
+      typename TissueOf::Outcome outcome;
+      const Field<D, Real>* u = tissue(t).mesh_field(outcome);
+      out = {};
+      for (int d = 0; u && d < D; ++d) {
+        const Grid<D>& grid = tissue(t).scene.grid;
+        out.shape[d] = grid.shape[d], out.spacing[d] = grid.spacing[d], out.origin[d] = grid.origin[d];
+        if constexpr (sizeof(Real) == sizeof(float))
+          out.single[d] = u->u[d].data();
+        else
+          out.exact[d] = u->u[d].data();
+      }
+      return status_of<TissueOf>(outcome);
+    }
+    return ECHOSPLINE_WRONG_VALUE;
+  }
+
   static int64_t landmarks(void* t, echospline_landmark* out, int64_t room) {
     const TissueOf& own = tissue(t);
     const State<D>& state = own.state;
@@ -216,6 +234,7 @@ struct Kind {
                                                        displacement<double>,
                                                        displacement<float>,
                                                        displacement_at,
+                                                       planes,
                                                        landmarks,
                                                        statistics,
                                                        state_size,
