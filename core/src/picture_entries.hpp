@@ -14,7 +14,6 @@ struct PictureEntries {
   void (*deform_single)(void* picture, const float* displacement);
   void (*deform_planes)(void* picture, const float* x,
                         const float* y);  // mm, a plane per direction: as a tissue of this level keeps them
-  void (*deform_planes_double)(void* picture, const double* x, const double* y);
   void (*draw)(void* picture, const echospline_needle* needle, void* out);
   void (*inverse)(void* picture, float* x, float* y);
   void (*check)(void* picture, echospline_picture_report& report);

@@ -32,7 +32,6 @@ const PictureEntries picture_entries = {
     [](void* picture, const double* u) { picture_of(picture).deform(u, u + 1, 2); },
     [](void* picture, const float* u) { picture_of(picture).deform(u, u + 1, 2); },
     [](void* picture, const float* x, const float* y) { picture_of(picture).deform(x, y, 1); },
-    [](void* picture, const double* x, const double* y) { picture_of(picture).deform(x, y, 1); },
     [](void* picture, const echospline_needle* needle, void* out) { picture_of(picture).draw(needle, out); },
     [](void* picture, float* x, float* y) { picture_of(picture).inverse(x, y); },
     [](void* picture, echospline_picture_report& report) { picture_of(picture).check(report); },

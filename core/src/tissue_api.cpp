@@ -193,13 +193,12 @@ echospline_status usable(echospline_tissue* t) {
 
 }  // namespace
 
-echospline_status echospline::planes_of(echospline_tissue* t, FieldPlanes& planes, Message& message) {
+echospline_status echospline::view_of(echospline_tissue* t, TissueView& view, Message& message) {
   if (!t) return refuse(message, ECHOSPLINE_NULL_POINTER, "a tissue must be given; got NULL");
-  if (!t->self) return refuse(message, ECHOSPLINE_FAILED_HANDLE, "a tissue that works must be given; its create had failed");
-  if (t->scene->counts.dimension != 2)
-    return refuse(message, ECHOSPLINE_WRONG_VALUE, "the tissue must be of dimension 2; got %d: pass displacements of the plane to deform",
-                  t->scene->counts.dimension);
-  return say(message, t->functions->planes(t->self, planes));
+  if (!t->self)
+    return refuse(message, ECHOSPLINE_FAILED_HANDLE, "a tissue that works must be given; its create had failed");
+  view = {t->self, t->functions, &t->scene->counts};
+  return ECHOSPLINE_OK;
 }
 
 extern "C" {

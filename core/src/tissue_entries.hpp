@@ -7,14 +7,8 @@ namespace echospline {
 struct SceneCounts {
   int32_t dimension;
   int64_t nodes, anchors, sources;
-};
-
-/// Displacement of a plane mesh as a tissue keeps it, mm: one plane of numbers per component, in one of two precisions.
-struct FieldPlanes {
-  const float* single[2];
-  const double* exact[2];  // nullptr where the field is in single precision
-  int32_t shape[2];
-  double spacing[2], origin[2];
+  int32_t shape[3];  // of the mesh
+  double spacing[3], origin[3];
 };
 
 /// Functions of one kind of tissue: dimension, kernel and precision.
@@ -25,7 +19,8 @@ struct TissueFunctions {
   echospline_status (*displacement)(void* tissue, double* out);
   echospline_status (*displacement_single)(void* tissue, float* out);
   echospline_status (*displacement_at)(void* tissue, const double* points, int64_t count, double* out);
-  echospline_status (*planes)(void* tissue, FieldPlanes& out);  // of a tissue in the plane
+  /// Displacement of a plane mesh in planes of single precision, valid until the next step; nullptr where the field has none.
+  echospline_status (*planes)(void* tissue, const float** x, const float** y);
   int64_t (*landmarks)(void* tissue, echospline_landmark* out, int64_t room);
   void (*statistics)(void* tissue, echospline_statistics& out);
   int64_t (*state_size)(const void* tissue);
@@ -49,7 +44,13 @@ struct TissueEntries {
   echospline_status (*follow)(const echospline_pose& now, const echospline_command& command, echospline_pose& next);
 };
 
-/// Field of a tissue for a picture; `message` says why there is none.
-echospline_status planes_of(echospline_tissue* tissue, FieldPlanes& planes, Message& message);
+/// A tissue for other parts of the interface.
+struct TissueView {
+  void* self;
+  const TissueFunctions* functions;
+  const SceneCounts* counts;
+};
+/// A status and a message where the handle is no tissue that works, else OK.
+echospline_status view_of(echospline_tissue* tissue, TissueView& view, Message& message);
 
 }  // namespace echospline

@@ -3,6 +3,7 @@
 #include <cstdio>
 #include <new>
 
+#include "../include/echospline/field.hpp"
 #include "../include/echospline/tissue.hpp"
 #include "tissue_entries.hpp"
 
@@ -58,71 +59,36 @@ Number* create(Given&&... given) {
   return memory ? new (memory) Number(static_cast<Given&&>(given)...) : nullptr;
 }
 
-template <class TissueOf>
-echospline_status status_of(typename TissueOf::Outcome outcome) {
-  return outcome == TissueOf::done        ? ECHOSPLINE_OK
-         : outcome == TissueOf::no_memory ? ECHOSPLINE_OUT_OF_MEMORY
-                                          : ECHOSPLINE_NOT_SOLVED;
-}
-
-template <int D, class Kernel, class Real>
+template <int D>
 struct Kind {
-  typedef Scene<D, Kernel, Real> SceneOf;
-  typedef Tissue<D, Kernel, Real> TissueOf;
+  typedef Scene<D> SceneOf;
+  typedef Tissue<D> TissueOf;
 
   static TissueOf& tissue(void* t) { return *static_cast<TissueOf*>(t); }
   static const TissueOf& tissue(const void* t) { return *static_cast<const TissueOf*>(t); }
   static const SceneOf& scene(const void* s) { return *static_cast<const SceneOf*>(s); }
+  static echospline_status status_of(typename TissueOf::Outcome outcome) {
+    return outcome == TissueOf::done        ? ECHOSPLINE_OK
+           : outcome == TissueOf::no_memory ? ECHOSPLINE_OUT_OF_MEMORY
+                                            : ECHOSPLINE_NOT_SOLVED;
+  }
 
   // -- tissue
 
   static void destroy_tissue(void* t) { destroy(&tissue(t)); }
   static void reset(void* t) { tissue(t).rest(); }
-  static echospline_status advance(void* t, const echospline_pose& pose) { return status_of<TissueOf>(tissue(t).advance(pose)); }
+  static echospline_status advance(void* t, const echospline_pose& pose) { return status_of(tissue(t).advance(pose)); }
 
   template <class Number>
   static echospline_status displacement(void* t, Number* out) {
-    TissueOf& own = tissue(t);
-    const SceneOf& given = own.scene;
-    const int64_t n = given.grid.size();
-    if constexpr (D == 2) {
-      typename TissueOf::Outcome outcome;
-      const Field<D, Real>* u = own.mesh_field(outcome);
-      for (int64_t i = 0; u && i < n; ++i)
-        for (int d = 0; d < D; ++d) out[i * D + d] = static_cast<Number>(u->u[d][i]);
-      return status_of<TissueOf>(outcome);
-    } else {
-      return status_of<TissueOf>(own.evaluate(
-          n, [&](int64_t i) { return given.grid.place(i); },
-          [&](int64_t i, const Vec<D>& u) {
-            for (int d = 0; d < D; ++d) out[i * D + d] = static_cast<Number>(u[d]);
-          }));
-    }
+    return status_of(tissue(t).mesh(out));
   }
   static echospline_status displacement_at(void* t, const double* points, int64_t count, double* out) {
-    return status_of<TissueOf>(tissue(t).evaluate(
-        count, [&](int64_t i) { return point_of<D>(points + i * D); },
-        [&](int64_t i, const Vec<D>& u) {
-          for (int d = 0; d < D; ++d) out[i * D + d] = u[d];
-        }));
+    return status_of(tissue(t).evaluate(points, count, out));
   }
-
-  static echospline_status planes(void* t, FieldPlanes& out) {
-    if constexpr (D == 2) {
-      typename TissueOf::Outcome outcome;
-      const Field<D, Real>* u = tissue(t).mesh_field(outcome);
-      out = {};
-      for (int d = 0; u && d < D; ++d) {
-        const Grid<D>& grid = tissue(t).scene.grid;
-        out.shape[d] = grid.shape[d], out.spacing[d] = grid.spacing[d], out.origin[d] = grid.origin[d];
-        if constexpr (sizeof(Real) == sizeof(float))
-          out.single[d] = u->u[d].data();
-        else
-          out.exact[d] = u->u[d].data();
-      }
-      return status_of<TissueOf>(outcome);
-    }
-    return ECHOSPLINE_WRONG_VALUE;
+  static echospline_status planes(void* t, const float** x, const float** y) {
+    *x = *y = nullptr;
+    return status_of(tissue(t).planes(*x, *y));
   }
 
   static int64_t landmarks(void* t, echospline_landmark* out, int64_t room) {
@@ -215,7 +181,7 @@ struct Kind {
         return refuse(message, "a contact in these is out of its range");
       last = saved.source;
     }
-    return status_of<TissueOf>(own.restore(count, [&](Array<Contact<D>>& contacts, State<D>& state) {
+    return status_of(own.restore(count, [&](Array<Contact<D>>& contacts, State<D>& state) {
       for (int64_t j = 0; j < count; ++j) {
         StateContact saved;
         std::memcpy(&saved, p + sizeof header + j * sizeof saved, sizeof saved);
@@ -245,7 +211,11 @@ struct Kind {
 
   static void destroy_scene(void* s) { destroy(static_cast<SceneOf*>(s)); }
   static SceneCounts counts(const void* s) {
-    return {D, scene(s).grid.size(), scene(s).anchored.anchors, scene(s).sources()};
+    const Grid<D>& grid = scene(s).grid;
+    SceneCounts out = {D, grid.size(), scene(s).anchored.anchors, scene(s).sources(), {}, {}, {}};
+    for (int d = 0; d < D; ++d)
+      out.shape[d] = grid.shape[d], out.spacing[d] = grid.spacing[d], out.origin[d] = grid.origin[d];
+    return out;
   }
   static void anchors(const void* s, double* out) {
     const SceneOf& own = scene(s);
@@ -265,9 +235,28 @@ struct Kind {
   }
   static constexpr SceneFunctions scene_functions = {destroy_scene, counts, anchors, sources, create_tissue, &tissue_functions};
 
-  template <class KernelFor>
-  static echospline_status create_scene(const echospline_scene_options& o, KernelFor kernel_for, void** out,
-                                        const SceneFunctions** functions, Message& message) {
+  template <class Kernel>
+  static KernelOf<D> kernel_for(const echospline_scene_options& o, double scale) {
+    const double nu = D == 2 && o.plane == ECHOSPLINE_PLANE_STRESS ? o.poisson / (1 + o.poisson) : o.poisson;
+    const double radius = o.radius / scale;
+    return kernel_of<D, Kernel>(D == 2 ? 1 / (2 * (1 - nu)) : 1 / (1 - nu), radius * radius);
+  }
+  template <class Real>
+  static typename SceneOf::FieldFor field_for(const echospline_scene_options& o) {
+    return o.kernel == ECHOSPLINE_THIN_PLATE ? create_field<D, ThinPlate<D>, Real> : create_field<D, Elastic<D>, Real>;
+  }
+
+  static echospline_status create_scene(const echospline_scene_options& o, void** out, const SceneFunctions** functions, Message& message) {
+    typename SceneOf::FieldFor make_field = field_for<float>(o);
+    if (o.precision == ECHOSPLINE_DOUBLE) {
+#ifdef ECHOSPLINE_SINGLE_ONLY
+      std::snprintf(message.text, sizeof message.text,
+                    "precision must be single in this build of the core; got double: use another build");
+      return ECHOSPLINE_WRONG_VALUE;
+#else
+      make_field = field_for<double>(o);
+#endif
+    }
     SceneOf* made = create<SceneOf>();
     if (!made) return ECHOSPLINE_OUT_OF_MEMORY;
     for (int d = 0; d < D; ++d) {
@@ -281,8 +270,11 @@ struct Kind {
                          o.tip == ECHOSPLINE_TIP_NODE};
     made->contact_room = o.contact_room > 0 ? o.contact_room : FIRST_ROOM;
     made->fingerprint = fingerprint(o);
+    const auto kernel = [&](double scale) {
+      return o.kernel == ECHOSPLINE_THIN_PLATE ? kernel_for<ThinPlate<D>>(o, scale) : kernel_for<Elastic<D>>(o, scale);
+    };
     const typename SceneOf::Outcome outcome =
-        there ? made->build(o.contact_spacing, o.anchor_spacing, kernel_for) : SceneOf::no_memory;
+        there ? made->build(o.contact_spacing, o.anchor_spacing, kernel, make_field) : SceneOf::no_memory;
     if (outcome == SceneOf::ready) {
       *out = made, *functions = &scene_functions;
       return ECHOSPLINE_OK;
@@ -310,25 +302,8 @@ struct Kind {
   }
 };
 
-template <int D>
-Elastic<D> elastic_for(const echospline_scene_options& o, double scale) {
-  const double nu = D == 2 && o.plane == ECHOSPLINE_PLANE_STRESS ? o.poisson / (1 + o.poisson) : o.poisson;
-  const double radius = o.radius / scale;
-  return {D == 2 ? 1 / (2 * (1 - nu)) : 1 / (1 - nu), radius * radius};
-}
-
-template <int D, class Real>
-echospline_status create_scene_of(const echospline_scene_options& o, void** scene, const SceneFunctions** functions, Message& message) {
-  if (o.kernel == ECHOSPLINE_THIN_PLATE)
-    return Kind<D, ThinPlate<D>, Real>::create_scene(o, [](double) { return ThinPlate<D>{}; }, scene, functions, message);
-  return Kind<D, Elastic<D>, Real>::create_scene(o, [&](double scale) { return elastic_for<D>(o, scale); }, scene, functions, message);
-}
-
 echospline_status create_scene(const echospline_scene_options& o, void** scene, const SceneFunctions** functions, Message& message) {
-  const bool single = o.precision == ECHOSPLINE_SINGLE;
-  if (o.dimension == 2)
-    return single ? create_scene_of<2, float>(o, scene, functions, message) : create_scene_of<2, double>(o, scene, functions, message);
-  return single ? create_scene_of<3, float>(o, scene, functions, message) : create_scene_of<3, double>(o, scene, functions, message);
+  return o.dimension == 2 ? Kind<2>::create_scene(o, scene, functions, message) : Kind<3>::create_scene(o, scene, functions, message);
 }
 
 echospline_status follow_command(const echospline_pose& now, const echospline_command& command, echospline_pose& next) {

@@ -67,52 +67,47 @@ inline bool invert(double* A, int64_t n, int64_t ld, int64_t* pivots) {
 
 /// G of one set of anchors. Rows of [U P] have all anchors for the first component, then for the next, then the motions; the entry of an
 /// anchor is less that of its parent.
-template <int D, class Kernel>
+template <int D>
 struct AnchoredKernel {
-  static constexpr int c = Kernel::components;
-
-  Kernel kernel;    ///< in conditioned coordinates (x - centre) / scale
-  Vec<D> centre;    ///< mm
-  double scale;     ///< mm
-  int64_t anchors;  ///< b
-  int64_t order;    ///< m = b c + motions
-  int64_t ld;       ///< m rounded up to ROW
-  int64_t padded;   ///< b rounded up to ROW
+  KernelOf<D> kernel;  ///< in conditioned coordinates (x - centre) / scale
+  int c = 1;           ///< components of the kernel
+  Vec<D> centre;       ///< mm
+  double scale = 1;    ///< mm
+  int64_t anchors = 0;  ///< b
+  int64_t order = 0;    ///< m = b c + motions
+  int64_t ld = 0;       ///< m rounded up to ROW
+  int64_t padded = 0;   ///< b rounded up to ROW
   Array<double> place[D];  ///< conditioned anchors, (padded)
   Array<int32_t> parent;   ///< of every anchor, before it; -1 for the first
   Array<double> inverse;   ///< L_B^-1, (m, ld)
 
   Vec<D> conditioned(const Vec<D>& p) const { return (1 / scale) * (p - centre); }
+  Vec<D> anchor(int64_t i) const {
+    Vec<D> p;
+    for (int d = 0; d < D; ++d) p[d] = place[d][i];
+    return p;
+  }
   /// What a spring of stiffness k adds to the diagonal, conditioned; 0 for an infinite one.
   double softness(double stiffness) const {
-    double unit = Kernel::per_spring / stiffness;
-    for (int i = 0; i < Kernel::length_power; ++i) unit /= scale;
-    for (int i = 0; i > Kernel::length_power; --i) unit *= scale;
+    double unit = kernel.per_spring / stiffness;
+    for (int i = 0; i < kernel.length_power; ++i) unit /= scale;
+    for (int i = 0; i > kernel.length_power; --i) unit *= scale;
     return unit;
   }
 
   /// Rows [U_xB P_x] of a conditioned point, (c, ld).
   void felt(const Vec<D>& x, double* out) const {
-    for (int a = 0; a < c; ++a)
-      for (int64_t i = order; i < ld; ++i) out[a * ld + i] = 0;
-    for (int64_t i = 0; i < anchors; i += DOUBLE_LANES) {
-      Doubles offset[D], U[c][c];
-      for (int d = 0; d < D; ++d) offset[d] = x[d] - load(place[d].data() + i);
-      kernel.at(offset, U);
-      const int64_t count = smaller<int64_t>(DOUBLE_LANES, anchors - i);
-      for (int a = 0; a < c; ++a)
-        for (int e = 0; e < c; ++e)
-          for (int64_t l = 0; l < count; ++l) out[a * ld + e * anchors + i + l] = U[a][e][l];
-    }
+    const double* places[D];
+    for (int d = 0; d < D; ++d) places[d] = place[d].data();
+    kernel.along(kernel, x, places, anchors, out, ld);
     for (int a = 0; a < c; ++a)
       for (int e = 0; e < c; ++e) {
         double* entry = out + a * ld + e * anchors;
         for (int64_t i = anchors; i-- > 1;) entry[i] -= entry[parent[i]];
       }
-    double R[c][Kernel::motions];
-    Kernel::motion(x, R);
+    kernel.motion(x, out + anchors * c, ld);
     for (int a = 0; a < c; ++a)
-      for (int j = 0; j < Kernel::motions; ++j) out[a * ld + anchors * c + j] = R[a][j];
+      for (int64_t i = order; i < ld; ++i) out[a * ld + i] = 0;
   }
   /// L_B^-1 of such rows, (c, ld).
   void held(const double* felt, double* out) const {
@@ -122,19 +117,17 @@ struct AnchoredKernel {
     }
   }
   /// G between two conditioned points of which one's `felt` and the other's `held` are known.
-  void green(const Vec<D>& x, const double* felt, const Vec<D>& y, const double* held, double (&G)[c][c]) const {
-    double offset[D];
-    for (int d = 0; d < D; ++d) offset[d] = x[d] - y[d];
-    kernel.at(offset, G);
+  void green(const Vec<D>& x, const double* felt, const Vec<D>& y, const double* held, double (&G)[D][D]) const {
+    kernel.at(kernel, x - y, G);
     for (int a = 0; a < c; ++a)
       for (int e = 0; e < c; ++e) G[a][e] -= dot(felt + a * ld, held + e * ld, ld);
   }
 
   enum Outcome { ready, no_memory, not_held };
-  /// Assemble and factor L_B for anchors in mm; `unscaled` is the kernel for one mm.
-  template <class Scale>
-  Outcome build(const Vec<D>* points, int64_t count, Scale kernel_for) {
-    anchors = count, order = count * c + Kernel::motions, ld = rounded_up(order, ROW), padded = rounded_up(count, ROW);
+  /// Assemble and factor L_B for anchors in mm; `kernel_for(scale)` describes the kernel in coordinates divided by a scale.
+  template <class KernelFor>
+  Outcome build(const Vec<D>* points, int64_t count, KernelFor kernel_for) {
+    anchors = count;
     double extent = 0;
     for (int d = 0; d < D; ++d) {
       double low = INFINITY, high = -INFINITY;
@@ -144,6 +137,7 @@ struct AnchoredKernel {
     }
     scale = extent > 0 ? extent / 2 : 1;
     kernel = kernel_for(scale);
+    c = kernel.components, order = count * c + kernel.motions, ld = rounded_up(order, ROW), padded = rounded_up(count, ROW);
     for (int d = 0; d < D; ++d) {
       if (!place[d].reserve(padded)) return no_memory;
       for (int64_t i = 0; i < count; ++i) place[d][i] = conditioned(points[i])[d];
@@ -155,7 +149,7 @@ struct AnchoredKernel {
       felt(conditioned(points[i]), row.data());
       for (int a = 0; a < c; ++a) {
         std::memcpy(inverse.data() + (a * count + i) * ld, row.data() + a * ld, static_cast<size_t>(order) * sizeof(double));
-        for (int j = 0; j < Kernel::motions; ++j)
+        for (int j = 0; j < kernel.motions; ++j)
           inverse[(count * c + j) * ld + a * count + i] = row[a * ld + count * c + j];
       }
     }
@@ -183,7 +177,7 @@ struct AnchoredKernel {
   }
   /// Whether the anchors leave no motion free: the rows of R' are independent (Gram and Schmidt, largest first).
   bool motions_determined(Array<double>& room) {
-    constexpr int p = Kernel::motions;
+    const int p = kernel.motions;
     const int64_t n = anchors * c, wide = rounded_up(n, ROW);
     if (n < p || !room.reserve(p * wide)) return false;
     for (int j = 0; j < p; ++j)

@@ -5,7 +5,7 @@
 // within a few coarse cells of every landmark and added. Nothing of the size (pixels x landmarks) is read.
 #pragma once
 #include "grid.hpp"
-#include "response.hpp"
+#include "kernels.hpp"
 
 namespace echospline::ECHOSPLINE_CORE {
 
@@ -28,6 +28,9 @@ struct CoarseGrid {
   }
 };
 
+template <int D, class Real>
+struct Planes;
+
 /// The field on the fine mesh, computed when it is asked for.
 template <class Kernel, class Real>
 class FineField {
@@ -35,7 +38,7 @@ class FineField {
   static constexpr int D = 2, c = Kernel::components, planes = c == 1 ? 1 : D;
   static constexpr int SIDE = 2 * REACH + 4;  // coarse points along a side of the region around a landmark
 
-  Field<D, Real> field;  ///< (ny, nx) per component, mm
+  Planes<D, Real> field;  ///< (ny, nx) per component, mm
 
   bool build(const Grid<D>& fine, const CoarseGrid<D>& coarse) {
     fine_ = fine, coarse_ = coarse;
@@ -44,73 +47,10 @@ class FineField {
            rows_.reserve(SIDE * planes * wide + 4 * D * wide) && fill_taps(wide);
   }
 
-  /// From the field at the coarse points and the landmarks, both conditioned by `centre` and `scale`.
-  template <class Landmarks>
-  void compute(const Field<D, Real>& coarse_field, const Landmarks& landmarks, const Kernel& kernel, const Vec<D>& centre, double scale) {
-    interpolate(coarse_field);
-    const Real* p = landmarks.values;
-    for (int64_t i = 0; i < landmarks.count; ++i, p += 2 * D) correct(p, p + D, kernel, centre, scale);
-  }
-
- private:
-  struct Taps {
-    Real w[4];
-  };
-  Grid<D> fine_;
-  CoarseGrid<D> coarse_;
-  Array<Taps> taps_[D];  ///< weights of the four coarse points around each place in a coarse cell (Lagrange, exact for cubics)
-  Array<Real> rows_;
-  int64_t wide_ = 0;
-
-  bool fill_taps(int64_t wide) {
-    wide_ = wide;
-    for (int d = 0; d < D; ++d)
-      for (int32_t i = 0; i < coarse_.stride[d]; ++i) {
-        const double t = static_cast<double>(i) / coarse_.stride[d];
-        taps_[d][i] = {{static_cast<Real>(-t * (t - 1) * (t - 2) / 6), static_cast<Real>((t + 1) * (t - 1) * (t - 2) / 2),
-                        static_cast<Real>(-(t + 1) * t * (t - 2) / 2), static_cast<Real>((t + 1) * t * (t - 1) / 6)}};
-      }
-    return true;
-  }
-
-  /// Cubic along x of a coarse row at `count` fine places, the first of them at the second coarse point.
-  void along_x(const Real* row, int64_t count, Real* out) const {
-    const int32_t stride = coarse_.stride[0];
-    for (int64_t x = 0; x < count; x += stride, ++row)
-      for (int32_t i = 0; i < smaller<int64_t>(stride, count - x); ++i) {
-        const Taps& t = taps_[0][i];
-        out[x + i] = t.w[0] * row[0] + t.w[1] * row[1] + t.w[2] * row[2] + t.w[3] * row[3];
-      }
-  }
-  static void along_y(const Taps& t, const Real* const (&row)[4], int64_t count, Real* out) {
-    for (int64_t x = 0; x < count; ++x) out[x] = t.w[0] * row[0][x] + t.w[1] * row[1][x] + t.w[2] * row[2][x] + t.w[3] * row[3][x];
-  }
-
-  void interpolate(const Field<D, Real>& coarse_field) {
-    const int64_t nx = fine_.shape[0], ny = fine_.shape[1], mx = coarse_.grid.shape[0];
-    for (int d = 0; d < D; ++d) {
-      int64_t next = 0;  // coarse rows that have been interpolated along x are kept in a ring of four
-      for (int64_t y = 0; y < ny; ++y) {
-        const int64_t j = y / coarse_.stride[1];
-        for (; next < j + 4; ++next) along_x(coarse_field.u[d].data() + next * mx, nx, rows_.data() + next % 4 * wide_);
-        const Real* const row[4] = {rows_.data() + j % 4 * wide_, rows_.data() + (j + 1) % 4 * wide_, rows_.data() + (j + 2) % 4 * wide_,
-                                    rows_.data() + (j + 3) % 4 * wide_};
-        along_y(taps_[1][y % coarse_.stride[1]], row, nx, field.u[d].data() + y * nx);
-      }
-    }
-  }
-
-  /// Kernel times weight at an offset.
-  template <class Number>
-  ECHOSPLINE_INLINE static void response(const Kernel& kernel, const Number (&offset)[D], const Real* weight, Number (&f)[planes]) {
-    Number U[c][c];
-    kernel.at(offset, U);
-    for (int d = 0; d < planes; ++d) {
-      if constexpr (c == 1)
-        f[d] = U[0][0];
-      else
-        f[d] = U[d][0] * weight[0] + U[d][1] * weight[1];
-    }
+  /// Interpolate the field at the coarse points; `correct` adds what that leaves out of every landmark's.
+  void compute(const Real* coarse_x, const Real* coarse_y) {
+    interpolate(coarse_x, 0);
+    interpolate(coarse_y, 1);
   }
 
   /// Add what interpolation leaves out of one landmark's field.
@@ -171,6 +111,66 @@ class FineField {
       }
     }
   }
+
+ private:
+  struct Taps {
+    Real w[4];
+  };
+  Grid<D> fine_;
+  CoarseGrid<D> coarse_;
+  Array<Taps> taps_[D];  ///< weights of the four coarse points around each place in a coarse cell (Lagrange, exact for cubics)
+  Array<Real> rows_;
+  int64_t wide_ = 0;
+
+  bool fill_taps(int64_t wide) {
+    wide_ = wide;
+    for (int d = 0; d < D; ++d)
+      for (int32_t i = 0; i < coarse_.stride[d]; ++i) {
+        const double t = static_cast<double>(i) / coarse_.stride[d];
+        taps_[d][i] = {{static_cast<Real>(-t * (t - 1) * (t - 2) / 6), static_cast<Real>((t + 1) * (t - 1) * (t - 2) / 2),
+                        static_cast<Real>(-(t + 1) * t * (t - 2) / 2), static_cast<Real>((t + 1) * t * (t - 1) / 6)}};
+      }
+    return true;
+  }
+
+  /// Cubic along x of a coarse row at `count` fine places, the first of them at the second coarse point.
+  void along_x(const Real* row, int64_t count, Real* out) const {
+    const int32_t stride = coarse_.stride[0];
+    for (int64_t x = 0; x < count; x += stride, ++row)
+      for (int32_t i = 0; i < smaller<int64_t>(stride, count - x); ++i) {
+        const Taps& t = taps_[0][i];
+        out[x + i] = t.w[0] * row[0] + t.w[1] * row[1] + t.w[2] * row[2] + t.w[3] * row[3];
+      }
+  }
+  static void along_y(const Taps& t, const Real* const (&row)[4], int64_t count, Real* out) {
+    for (int64_t x = 0; x < count; ++x) out[x] = t.w[0] * row[0][x] + t.w[1] * row[1][x] + t.w[2] * row[2][x] + t.w[3] * row[3][x];
+  }
+
+  void interpolate(const Real* coarse_field, int d) {
+    const int64_t nx = fine_.shape[0], ny = fine_.shape[1], mx = coarse_.grid.shape[0];
+    int64_t next = 0;  // coarse rows that have been interpolated along x are kept in a ring of four
+    for (int64_t y = 0; y < ny; ++y) {
+      const int64_t j = y / coarse_.stride[1];
+      for (; next < j + 4; ++next) along_x(coarse_field + next * mx, nx, rows_.data() + next % 4 * wide_);
+      const Real* const row[4] = {rows_.data() + j % 4 * wide_, rows_.data() + (j + 1) % 4 * wide_, rows_.data() + (j + 2) % 4 * wide_,
+                                  rows_.data() + (j + 3) % 4 * wide_};
+      along_y(taps_[1][y % coarse_.stride[1]], row, nx, field.u[d].data() + y * nx);
+    }
+  }
+
+  /// Kernel times weight at an offset.
+  template <class Number>
+  ECHOSPLINE_INLINE static void response(const Kernel& kernel, const Number (&offset)[D], const Real* weight, Number (&f)[planes]) {
+    Number U[c][c];
+    kernel.at(offset, U);
+    for (int d = 0; d < planes; ++d) {
+      if constexpr (c == 1)
+        f[d] = U[0][0];
+      else
+        f[d] = U[d][0] * weight[0] + U[d][1] * weight[1];
+    }
+  }
+
 };
 
 }  // namespace echospline::ECHOSPLINE_CORE

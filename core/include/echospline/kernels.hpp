@@ -22,6 +22,8 @@ struct ThinPlate {
   static constexpr int length_power = D == 2 ? 2 : 1;  ///< of the kernel's values
   static constexpr double per_spring = D == 2 ? 16 * PI : 8 * PI;
 
+  static ThinPlate from(double, double) { return {}; }
+
   /// U at an offset, for a scalar or a vector of numbers.
   template <class Number>
   ECHOSPLINE_INLINE void at(const Number (&offset)[D], Number (&U)[1][1]) const {
@@ -61,6 +63,8 @@ struct Elastic {
   double coupling;  ///< c in the plane, 1 / (1 - nu) in space
   double radius2;   ///< square of the regularisation length, in the coordinates of the offsets
 
+  static Elastic from(double coupling, double radius2) { return {coupling, radius2}; }
+
   template <class Number>
   ECHOSPLINE_INLINE void at(const Number (&offset)[D], Number (&U)[D][D]) const {
     typedef std::remove_cvref_t<decltype(scalar(offset[0]))> Real;
@@ -97,5 +101,55 @@ struct Elastic {
   static double scalar(Doubles);
   static double scalar(double);
 };
+
+/// A kernel as the algebra of landmarks sees it, which is the same for all: numbers and functions in double precision.
+template <int D>
+struct KernelOf {
+  int components;      ///< c
+  int motions;         ///< polynomials
+  int length_power;    ///< of the kernel's values
+  double per_spring;   ///< what a spring of stiffness k adds, times k
+  double coupling, radius2;  ///< as `from` takes them
+  void (*at)(const KernelOf& own, const Vec<D>& offset, double (&U)[D][D]);
+  /// At the offsets from `count` places to x: (c, c) rows of `count` numbers, `stride` from a component of x to the next.
+  void (*along)(const KernelOf& own, const Vec<D>& x, const double* const (&place)[D], int64_t count, double* out, int64_t stride);
+  void (*motion)(const Vec<D>& x, double* out, int64_t stride);  ///< (c, motions)
+};
+
+template <int D, class Kernel>
+struct KernelFunctions {
+  static constexpr int c = Kernel::components;
+  static void at(const KernelOf<D>& own, const Vec<D>& offset, double (&U)[D][D]) {
+    double small[c][c];
+    Kernel::from(own.coupling, own.radius2).at(offset.v, small);
+    for (int a = 0; a < c; ++a)
+      for (int e = 0; e < c; ++e) U[a][e] = small[a][e];
+  }
+  static void along(const KernelOf<D>& own, const Vec<D>& x, const double* const (&place)[D], int64_t count, double* out, int64_t stride) {
+    const Kernel kernel = Kernel::from(own.coupling, own.radius2);
+    for (int64_t i = 0; i < count; i += DOUBLE_LANES) {
+      Doubles offset[D], U[c][c];
+      for (int d = 0; d < D; ++d) offset[d] = x[d] - load(place[d] + i);
+      kernel.at(offset, U);
+      for (int a = 0; a < c; ++a)
+        for (int e = 0; e < c; ++e)
+          for (int64_t l = 0; l < smaller<int64_t>(DOUBLE_LANES, count - i); ++l) out[a * stride + e * count + i + l] = U[a][e][l];
+    }
+  }
+  static void motion(const Vec<D>& x, double* out, int64_t stride) {
+    double R[c][Kernel::motions];
+    Kernel::motion(x, R);
+    for (int a = 0; a < c; ++a)
+      for (int j = 0; j < Kernel::motions; ++j) out[a * stride + j] = R[a][j];
+  }
+};
+
+/// The description of a kernel for coordinates in which `coupling` and `radius2` hold.
+template <int D, class Kernel>
+KernelOf<D> kernel_of(double coupling, double radius2) {
+  typedef KernelFunctions<D, Kernel> Functions;
+  return {Kernel::components, Kernel::motions, Kernel::length_power, Kernel::per_spring, coupling,
+          radius2,            Functions::at,   Functions::along,     Functions::motion};
+}
 
 }  // namespace echospline::ECHOSPLINE_CORE

@@ -1,5 +1,6 @@
 // One session: the state of the tissue, and the step from a needle pose to the field, Algorithm 2.
 #pragma once
+#include "response.hpp"
 #include "scene.hpp"
 
 namespace echospline::ECHOSPLINE_CORE {
@@ -38,29 +39,24 @@ struct State {
   int64_t held_back = 0;
 };
 
-template <int D, class Kernel, class Real>
+template <int D>
 class Tissue {
  public:
-  static constexpr int c = Kernel::components;
-  typedef Scene<D, Kernel, Real> SceneOf;
-  typedef Response<D, Kernel, Real> ResponseOf;
-  typedef Column<D, c> ColumnOf;
-  typedef Sides<D, c> SidesOf;
-
   enum Outcome { done, no_memory, not_solved };
 
-  const SceneOf& scene;
+  const Scene<D>& scene;
   State<D> state;
-  Field<D, Real> field;  ///< of the state at the scene's points, mm
   int64_t steps = 0, joined = 0, left = 0, allocations = 0;
 
-  explicit Tissue(const SceneOf& given) : scene(given) {}
+  explicit Tissue(const Scene<D>& given) : scene(given), c(given.anchored.c) {}
+  ~Tissue() {
+    if (field_) field_->destroy();
+  }
 
   bool build() {
     const int64_t K = scene.sources();
-    return response_.build(&scene.anchored, &scene.points, &scene.table, K, 1) &&
-           field.reserve(scene.points.room()) && next_field_.reserve(scene.points.room()) &&
-           rest_field_.reserve(scene.points.room()) && build_fine() && touched_.reserve(K) && alongs_.reserve(K) && wanted_.reserve(K) &&
+    field_ = scene.field->create_session();
+    return field_ && response_.build(&scene.anchored, field_, K) && touched_.reserve(K) && alongs_.reserve(K) && wanted_.reserve(K) &&
            reserve(smaller(larger<int64_t>(scene.contact_room, 1), larger<int64_t>(K, 1)));
   }
   double residual() const { return response_.residual; }
@@ -69,7 +65,7 @@ class Tissue {
   /// Tissue that no needle has touched.
   void rest() {
     state.count = 0, state.tip = {}, state.posed = false, state.reach = 0, state.held_back = 0;
-    field.clear();
+    field_->clear();
   }
 
   /// State after the needle has moved to a pose. On failure the state has not changed.
@@ -81,14 +77,14 @@ class Tissue {
     if (outcome != done) return outcome;
 
     Step step;
-    const SidesOf& given = move(n, step);
-    typename ResponseOf::Largest most = spread(given, step, field, next_field_);
+    const Sides<D>& given = move(n, step);
+    const Largest most = spread(given, step, false);
     double reach2 = most.reach2;
     int64_t held_back = state.held_back;
     const double limit = allowed(n);
     if (most.change2 > limit * limit) {
       hold_back(step, limit);
-      reach2 = reach2_of(next_field_);
+      reach2 = reach2_of_next();
       ++held_back;
     }
     for (int64_t j = 0; j < next_count_; ++j) next_[j].q = new_q_[j];
@@ -97,13 +93,13 @@ class Tissue {
       next_count_ = kept_count;
       outcome = set_contacts(next_, next_count_);
       if (outcome != done) return outcome;
-      reach2 = solve_and_spread(next_, next_count_, step.tip, next_field_).reach2;
+      reach2 = solve_and_spread(next_, next_count_, step.tip).reach2;
     }
     // nothing can fail from here on
     state.contacts.swap(next_);
     state.count = next_count_, state.tip = step.tip, state.posed = true, state.before = {n.entry, n.tip};
     state.reach = std::sqrt(reach2), state.held_back = held_back;
-    field.swap(next_field_);
+    field_->commit();
     ++steps;
     return done;
   }
@@ -118,76 +114,49 @@ class Tissue {
     next_count_ = count, tip = fresh.tip;
     const Outcome outcome = set_contacts(next_, count);
     if (outcome != done) return outcome;
-    const double reach2 = solve_and_spread(next_, count, tip, next_field_).reach2;
+    const double reach2 = solve_and_spread(next_, count, tip).reach2;
     state.contacts.swap(next_);
     state.count = count, state.tip = tip, state.posed = fresh.posed, state.before = fresh.before;
     state.held_back = fresh.held_back, state.reach = std::sqrt(reach2);
-    field.swap(next_field_);
+    field_->commit();
     return done;
   }
 
-  /// Displacement at any points, mm: `place(i)` gives a point in mm, `put(i, u)` takes its displacement.
-  template <class Place, class Put>
-  Outcome evaluate(int64_t count, Place place, Put put) {
-    typename ResponseOf::Landmarks landmarks;
+  /// Displacement at points (count, D) mm.
+  Outcome evaluate(const double* points, int64_t count, double* out) {
+    LandmarkWeights<D> landmarks;
     const Outcome outcome = present(landmarks);
-    if (outcome != done) return outcome;
-    constexpr int lanes = Lanes<Real>::count;
-    constexpr int64_t block = Points<D, Real>::block;
-    const bool still = !state.tip.present && state.count == 0;
-    for (int64_t first = 0; first < count; first += block) {
-      Real at[D][block];
-      for (int64_t i = 0; i < block; ++i) {
-        const Vec<D> p = scene.anchored.conditioned(place(smaller(first + i, count - 1)));
-        for (int d = 0; d < D; ++d) at[d][i] = static_cast<Real>(p[d]);
-      }
-      Vector<Real> u[D][VECTORS] = {};
-      if (!still) response_.evaluate(landmarks, at[0], block, u);
-      for (int64_t i = 0; i < smaller(block, count - first); ++i) {
-        Vec<D> moved;
-        for (int d = 0; d < D; ++d) moved[d] = u[d][i / lanes][i % lanes];
-        put(first + i, moved);
-      }
-    }
-    return done;
+    if (outcome == done) field_->evaluate(landmarks, points, count, out);
+    return outcome;
   }
-
-  /// Landmarks of the present state with their weights, as `evaluate` reads them.
-  Outcome present(typename ResponseOf::Landmarks& landmarks) {
-    const Outcome outcome = set_contacts(state.contacts, state.count);
-    if (outcome != done) return outcome;
-    const Weighted weighted = solve(state.contacts, state.count, state.tip);
-    landmarks = response_.gather(w_, weighted.column, weighted.s);
-    return done;
+  /// Displacement of every mesh node, (n, D) mm.
+  template <class Number>
+  Outcome mesh(Number* out) {
+    LandmarkWeights<D> landmarks;
+    const Outcome outcome = field_->mesh_needs_landmarks() ? present(landmarks) : done;
+    if (outcome == done) field_->mesh(landmarks, out);
+    return outcome;
   }
-
-  /// Displacement of every node of a plane mesh: one plane of numbers per component, mm; nullptr when `outcome` is not `done`.
-  const Field<D, Real>* mesh_field(Outcome& outcome) {
-    outcome = done;
-    if (!scene.fine()) return &field;
-    if constexpr (D == 2) {
-      typename ResponseOf::Landmarks landmarks;
-      outcome = present(landmarks);
-      if (outcome != done) return nullptr;
-      fine_.compute(field, landmarks, scene.anchored.kernel, scene.anchored.centre, scene.anchored.scale);
-      return &fine_.field;
-    }
-    return nullptr;
+  /// The same in planes of single precision, valid until the next step; nullptr where the field has none.
+  Outcome planes(const float*& x, const float*& y) {
+    LandmarkWeights<D> landmarks;
+    const Outcome outcome = field_->mesh_needs_landmarks() ? present(landmarks) : done;
+    if (outcome == done) field_->planes(landmarks, x, y);
+    return outcome;
   }
 
  private:
-  ResponseOf response_;
-  Field<D, Real> next_field_, rest_field_;
-  struct NoFineField {};
-  [[no_unique_address]] std::conditional_t<D == 2, FineField<Kernel, Real>, NoFineField> fine_;
+  const int c;
+  Response<D> response_;
+  SessionField<D>* field_ = nullptr;
   Array<Contact<D>> next_;
   int64_t next_count_ = 0;
   Array<int32_t> touched_;
   Array<double> alongs_;
   Array<char> wanted_;
   Array<Vec<D>> new_q_, free_;
-  ColumnOf tip_column_, other_column_;
-  SidesOf q_, w_;
+  Column<D> tip_column_, other_column_;
+  Sides<D> q_, w_;
   Array<int64_t> leaving_;
   Array<double> small_, small_sides_;
 
@@ -200,9 +169,14 @@ class Tissue {
     bool has_column() const { return tip.present && on_tip < 0; }
   };
 
-  bool build_fine() {
-    if constexpr (D == 2) return !scene.fine() || fine_.build(scene.grid, scene.coarse);
-    return true;
+  /// Weights of all landmarks of the present state; none where it is at rest.
+  Outcome present(LandmarkWeights<D>& landmarks) {
+    if (!state.tip.present && state.count == 0) return done;
+    const Outcome outcome = set_contacts(state.contacts, state.count);
+    if (outcome != done) return outcome;
+    const Weighted weighted = solve(state.contacts, state.count, state.tip);
+    response_.gather(w_, weighted.column, weighted.s, landmarks);
+    return done;
   }
 
   // ---- Contacts that come and go -----------------------------------------------------------------------------------------------------
@@ -213,10 +187,9 @@ class Tissue {
     if (!kept.reserve(contacts) || !kept_next.reserve(contacts)) return false;
     for (int64_t i = 0; i < state.count; ++i) kept[i] = state.contacts[i];
     for (int64_t i = 0; i < next_count_; ++i) kept_next[i] = next_[i];
-    if (!new_q_.reserve(contacts) || !free_.reserve(contacts) || !tip_column_.reserve(ld, wide) ||
-        !other_column_.reserve(ld, wide) || !q_.reserve(wide) || !w_.reserve(wide) || !leaving_.reserve(contacts) ||
-        !small_.reserve(contacts * c * wide) || !small_sides_.reserve(D * wide) || !response_.reserve(contacts) ||
-        !response_.reserve_landmarks())
+    if (!new_q_.reserve(contacts) || !free_.reserve(contacts) || !tip_column_.reserve(c, ld, wide) ||
+        !other_column_.reserve(c, ld, wide) || !q_.reserve(c, wide) || !w_.reserve(c, wide) || !leaving_.reserve(contacts) ||
+        !small_.reserve(contacts * c * wide) || !small_sides_.reserve(D * wide) || !response_.reserve(contacts))
       return false;
     state.contacts.swap(kept), next_.swap(kept_next);
     return true;
@@ -236,7 +209,7 @@ class Tissue {
       const int32_t source = contacts[j].source;
       wanted_[source] = 0;
       if (response_.slot_of[source] >= 0 || !there) continue;
-      there = response_.join(source, scene.contact_place(source), softness_of(source));
+      there = response_.join(source, scene.field->contact_place(source), softness_of(source));
       ++joined, ++changes;
     }
     if (!there) return not_solved;
@@ -264,12 +237,12 @@ class Tissue {
       } else if (p.immediate) {
         continue;
       } else if (n.depth >= ZERO_LENGTH) {
-        along = distance(n, scene.source[source], field.at(scene.at[source]), p.drag).along;
+        along = distance(n, scene.source[source], field_->now(source), p.drag).along;
       }
       Contact<D>& row = next_[rows++];
       const bool held = old && old->touching;
       row.source = static_cast<int32_t>(source), row.touching = touching;
-      row.q = old ? old->q : field.at(scene.at[source]);
+      row.q = old ? old->q : field_->now(source);
       row.along = held ? old->along : smaller(larger(along, 0.0), n.depth);
       row.grip = old && (held || !touching) ? old->grip
                                             : p.drag * (across(row.q, n.axis) - (n.entry + row.along * n.axis));
@@ -300,7 +273,7 @@ class Tissue {
           for (int d = D; d-- > 1;) place = place * lattice.lines[d] + line[d];
           const int32_t source = lattice.source[place * lattice.lines[0] + i];
           if (source < 0) continue;
-          const Distance<D> to = distance(n, scene.source[source], field.at(scene.at[source]), p.drag);
+          const Distance<D> to = distance(n, scene.source[source], field_->now(source), p.drag);
           // the root, for nodes at delta itself, as a lattice has them: its square would tell some of them apart by rounding
           if (to.d2 <= near2 && std::sqrt(to.d2) <= p.delta && to.along <= n.depth - lattice.gap)
             touched_[count] = source, alongs_[count++] = to.along;
@@ -371,12 +344,7 @@ class Tissue {
   template <class Displacement>
   void fill(int64_t count, const Step& step, Displacement q) {
     for (int64_t j = 0; j < count; ++j) q_.set(response_.slot_of[next_[j].source], j == step.on_tip ? step.tip.q : q(j));
-    clear_beyond(count);
-  }
-  void clear_beyond(int64_t count) {
-    const int64_t used = count * c, n = rounded_up(used, ROW);
-    for (int r = 0; r < SidesOf::count; ++r)
-      for (int64_t i = used; i < n; ++i) q_.side(r)[i] = 0;
+    q_.clear_beyond(count);
   }
   int64_t contact_at(const Array<Contact<D>>& contacts, int64_t count, const TipLandmark<D>& tip) const {
     for (int64_t j = 0; tip.present && j < count; ++j)
@@ -386,7 +354,7 @@ class Tissue {
 
   /// New displacements of contacts (`new_q_`) and tip, and the field without the contacts that have left, at those (`free_`). Returns the
   /// displacements to be spread.
-  const SidesOf& move(const Needle<D>& n, Step& step) {
+  const Sides<D>& move(const Needle<D>& n, Step& step) {
     const Interaction& p = scene.interaction;
     const int64_t k = next_count_;
     const double left_over = kept(p, n.dt);
@@ -454,14 +422,14 @@ class Tissue {
   void find_free(int64_t leaving, const Step& step) {
     fill(next_count_, step, [&](int64_t j) { return new_q_[j]; });
     for (int64_t i = 0; i < leaving; ++i) q_.set(response_.slot_of[next_[leaving_[i]].source], Vec<D>{});
-    clear_beyond(next_count_);
-    const ColumnOf* column = step.has_column() ? &tip_column_ : nullptr;
+    q_.clear_beyond(next_count_);
+    const Column<D>* column = step.has_column() ? &tip_column_ : nullptr;
     Vec<D> s{};
-    double S[c][c];
+    double S[D][D] = {}, inverse[D][D] = {};
     if (column) {
       s = response_.tip_weight(*column, q_, step.tip.q, step.softness);
-      for (int a = 0; a < c; ++a)
-        for (int e = 0; e < c; ++e) S[a][e] = column->own[a][e] + (a == e ? step.softness : 0);
+      response_.add_softness(column->own, step.softness, S);
+      invert_small<D>(c, S, inverse);
     }
     response_.weights(q_, column, s, w_);
     const int64_t n = leaving * c, ld = rounded_up(n, ROW), ldk = response_.ldk;
@@ -469,21 +437,18 @@ class Tissue {
     double* b = small_sides_.data();
     for (int64_t i = 0; i < n; ++i) {
       const int64_t x = scalar_of(i);
-      double f[c];
-      if (column) {
-        for (int a = 0; a < c; ++a) f[a] = column->Pg[a * ldk + x];
-        solve_small(S, f);
-      }
+      double f[D] = {};
+      for (int a = 0; column && a < c; ++a)
+        for (int e = 0; e < c; ++e) f[a] += inverse[a][e] * column->Pg[e * ldk + x];
       for (int64_t l = 0; l < n; ++l) {
         const int64_t y = scalar_of(l);
         double value = response_.P[x * ldk + y];
-        if (column)
-          for (int a = 0; a < c; ++a) value += f[a] * column->Pg[a * ldk + y];
+        for (int a = 0; column && a < c; ++a) value += f[a] * column->Pg[a * ldk + y];
         A[i * ld + l] = value;
       }
-      for (int r = 0; r < SidesOf::count; ++r) b[r * ld + i] = -w_.side(r)[x];
+      for (int r = 0; r < w_.count; ++r) b[r * ld + i] = -w_.side(r)[x];
     }
-    solve_positive(A, n, ld, b, SidesOf::count);
+    solve_positive(A, n, ld, b, w_.count);
     for (int64_t i = 0; i < leaving; ++i)
       for (int d = 0; d < D; ++d) free_[leaving_[i]][d] = c == 1 ? b[d * ld + i] : b[i * D + d];
   }
@@ -513,22 +478,22 @@ class Tissue {
   // ---- The field ----------------------------------------------------------------------------------------------------------------------
 
   /// Field of contacts with displacements `q` and the step's tip, whose column has been met.
-  typename ResponseOf::Largest spread(const SidesOf& q, Step& step, const Field<D, Real>& was, Field<D, Real>& out) {
-    const ColumnOf* column = step.has_column() ? &tip_column_ : nullptr;
+  Largest spread(const Sides<D>& q, Step& step, bool at_rest) {
+    const Column<D>* column = step.has_column() ? &tip_column_ : nullptr;
     step.s = column ? response_.tip_weight(*column, q, step.tip.q, step.softness) : Vec<D>{};
     response_.weights(q, column, step.s, w_);
-    return response_.field(w_, column, step.s, was, scene.mask, out);
+    return response_.field(w_, column, step.s, at_rest);
   }
 
   struct Weighted {
-    const ColumnOf* column;
+    const Column<D>* column;
     Vec<D> s;
   };
   /// Weights (`w_`) of contacts that are set, and of a tip.
   Weighted solve(const Array<Contact<D>>& contacts, int64_t count, const TipLandmark<D>& tip) {
     const int64_t on_tip = contact_at(contacts, count, tip);
     for (int64_t j = 0; j < count; ++j) q_.set(response_.slot_of[contacts[j].source], j == on_tip ? tip.q : contacts[j].q);
-    clear_beyond(count);
+    q_.clear_beyond(count);
     Weighted weighted{tip.present && on_tip < 0 ? &tip_column_ : nullptr, {}};
     if (weighted.column) {
       response_.meet(scene.anchored.conditioned(tip.place), tip_column_);
@@ -537,17 +502,13 @@ class Tissue {
     response_.weights(q_, weighted.column, weighted.s, w_);
     return weighted;
   }
-  typename ResponseOf::Largest solve_and_spread(const Array<Contact<D>>& contacts, int64_t count, const TipLandmark<D>& tip,
-                                                Field<D, Real>& out) {
+  Largest solve_and_spread(const Array<Contact<D>>& contacts, int64_t count, const TipLandmark<D>& tip) {
     const Weighted weighted = solve(contacts, count, tip);
-    return response_.field(w_, weighted.column, weighted.s, field, scene.mask, out);
+    return response_.field(w_, weighted.column, weighted.s, false);
   }
-  double reach2_of(const Field<D, Real>& u) const {
+  double reach2_of_next() const {
     double reach2 = 0;
-    for (int64_t i = 0; i < scene.sources(); ++i) {
-      const Vec<D> moved = u.at(scene.at[i]);
-      reach2 = larger(reach2, dot(moved, moved));
-    }
+    for (int64_t i = 0; i < scene.sources(); ++i) reach2 = larger(reach2, dot(field_->next(i), field_->next(i)));
     return reach2;
   }
 
@@ -566,23 +527,17 @@ class Tissue {
     if (step.tip.present) stay.tip.q = value_before(step.tip.place);
     fill(next_count_, stay, [&](int64_t j) { return next_[j].q; });
     if (step.has_column()) response_.meet(scene.anchored.conditioned(step.tip.place), tip_column_);
-    spread(q_, stay, field, rest_field_);
+    spread(q_, stay, true);
     const double share = largest_share(limit);
     for (int64_t j = 0; j < next_count_; ++j) new_q_[j] = next_[j].q + share * (new_q_[j] - next_[j].q);
     step.tip.q = stay.tip.q + share * (step.tip.q - stay.tip.q);
-    const Real part = static_cast<Real>(share);
-    for (int d = 0; d < D; ++d) {
-      Real* u = next_field_.u[d].data();
-      const Real* r = rest_field_.u[d].data();
-      for (int64_t i = 0; i < scene.points.room(); ++i) u[i] = r[i] + part * (u[i] - r[i]);
-    }
+    field_->blend(share);
   }
   /// Largest t in [0, 1] with |rest + t (next - rest) - field| <= limit at every source; 0 where even `rest` is beyond.
   double largest_share(double limit) const {
     double share = 1;
     for (int64_t i = 0; i < scene.sources(); ++i) {
-      const int64_t at = scene.at[i];
-      const Vec<D> start = rest_field_.at(at) - field.at(at), step = next_field_.at(at) - rest_field_.at(at);
+      const Vec<D> start = field_->rest(i) - field_->now(i), step = field_->next(i) - field_->rest(i);
       const double a = dot(step, step), b = dot(start, step), e = dot(start, start) - limit * limit;
       if (e > 0) return 0;
       if (a > 0) share = smaller(share, (std::sqrt(larger(b * b - a * e, 0.0)) - b) / a);
@@ -600,20 +555,9 @@ class Tissue {
     if (!last.has_column()) return u;
     response_.meet(scene.anchored.conditioned(before.place), other_column_);
     const Vec<D> s = response_.tip_weight(other_column_, q_, before.q, scene.softness_near(before.place));
-    double G[c][c];
-    scene.anchored.green(tip_column_.place, tip_column_.felt.data(), other_column_.place, other_column_.held.data(), G);
-    for (int a = 0; a < c; ++a)
-      for (int e = 0; e < c; ++e)
-        G[a][e] -= dot(tip_column_.g.data() + a * response_.ldk, other_column_.Pg.data() + e * response_.ldk,
-                       rounded_up(response_.count * c, ROW));
-    for (int d = 0; d < D; ++d) {
-      if constexpr (c == 1) {
-        u[d] += G[0][0] * s[d];
-      } else {
-        for (int e = 0; e < c; ++e) u[d] += G[d][e] * s[e];
-      }
-    }
-    return u;
+    double G[D][D];
+    response_.between(tip_column_, other_column_, G);
+    return u + response_.times(G, s);
   }
 
   /// Keep the contacts that touch the needle or are not yet at rest in the field without them; how many.
