@@ -34,6 +34,11 @@ def test_rest_is_a_fixed_point(kernel):
     assert not model.displacement(still).any()
 
 
+def test_a_kernel_of_space_is_refused_in_the_plane():
+    with pytest.raises(InputError, match="kernel of the plane"):
+        TPSModel(GRID, kernel=ThinPlate(dimension=3))
+
+
 def test_one_step_equals_algorithm_1_by_another_library():
     # landmarks and targets written down from (12)-(15), the spline by scipy
     model = TPSModel(GRID, parameters=LITERAL, precision="double")

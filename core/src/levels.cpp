@@ -33,11 +33,11 @@ uint64_t saved_registers() {
 }
 
 int32_t best() {
-  constexpr uint32_t FMA = 1u << 12, OSXSAVE = 1u << 27, AVX = 1u << 28;                     // leaf 1, ecx
-  constexpr uint32_t BMI1 = 1u << 3, AVX2 = 1u << 5, BMI2 = 1u << 8;                         // leaf 7, ebx
+  constexpr uint32_t FMA = 1u << 12, OSXSAVE = 1u << 27, AVX = 1u << 28;                        // leaf 1, ecx
+  constexpr uint32_t BMI1 = 1u << 3, AVX2 = 1u << 5, BMI2 = 1u << 8;                            // leaf 7, ebx
   constexpr uint32_t F = 1u << 16, DQ = 1u << 17, CD = 1u << 28, BW = 1u << 30, VL = 1u << 31;  // leaf 7, ebx
-  constexpr uint32_t F16C = 1u << 29, MOVBE = 1u << 22;                                      // leaf 1, ecx
-  constexpr uint32_t LZCNT = 1u << 5;                                                        // leaf 0x80000001, ecx
+  constexpr uint32_t F16C = 1u << 29, MOVBE = 1u << 22;                                         // leaf 1, ecx
+  constexpr uint32_t LZCNT = 1u << 5;                                                           // leaf 0x80000001, ecx
   uint32_t a, b, c, d;
   if (!__get_cpuid(1, &a, &b, &c, &d)) return ECHOSPLINE_LEVEL_BASELINE;
   constexpr uint32_t first = FMA | OSXSAVE | AVX | F16C | MOVBE;

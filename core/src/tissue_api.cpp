@@ -26,8 +26,9 @@ struct echospline_tissue {
 
 namespace {
 
-constexpr int64_t MOST_NODES = int64_t{1} << 27;  // of a mesh: 134 million, beyond which indices and memory make no sense
-constexpr int64_t MOST_ANCHORS = 4000;            // their system is a full matrix: 128 MB of it
+constexpr int64_t MOST_NODES = int64_t{1}
+                               << 27;   // of a mesh: 134 million, beyond which indices and memory make no sense
+constexpr int64_t MOST_ANCHORS = 4000;  // their system is a full matrix: 128 MB of it
 
 template <class... Numbers>
 echospline_status refuse(Message& message, echospline_status status, const char* format, Numbers... numbers) {
@@ -46,21 +47,27 @@ echospline_status check_shape(const echospline_scene_options& o, Message& m) {
   int64_t nodes = 1;
   for (int d = 0; d < o.dimension; ++d) {
     if (o.shape[d] < 2)
-      return refuse(m, ECHOSPLINE_WRONG_VALUE, "a mesh must have 2 nodes or more along %c; got %d: set shape", axes[d], o.shape[d]);
-    if (!(o.spacing[d] >= 1e-6 && o.spacing[d] <= 1e6))  // squares of lengths have to be numbers in single precision, too
-      return refuse(m, ECHOSPLINE_WRONG_VALUE, "spacing along %c must be a number from 1e-06 to 1e+06 mm; got %g", axes[d], o.spacing[d]);
+      return refuse(m, ECHOSPLINE_WRONG_VALUE, "a mesh must have 2 nodes or more along %c; got %d: set shape", axes[d],
+                    o.shape[d]);
+    if (!(o.spacing[d] >= 1e-6 &&
+          o.spacing[d] <= 1e6))  // squares of lengths have to be numbers in single precision, too
+      return refuse(m, ECHOSPLINE_WRONG_VALUE, "spacing along %c must be a number from 1e-06 to 1e+06 mm; got %g",
+                    axes[d], o.spacing[d]);
     if (!(std::fabs(o.origin[d]) < 1e9))
-      return refuse(m, ECHOSPLINE_WRONG_VALUE, "origin along %c must be a finite number in mm, below 1e9; got %g", axes[d], o.origin[d]);
+      return refuse(m, ECHOSPLINE_WRONG_VALUE, "origin along %c must be a finite number in mm, below 1e9; got %g",
+                    axes[d], o.origin[d]);
     nodes *= o.shape[d];
     if (nodes > MOST_NODES)
-      return refuse(m, ECHOSPLINE_WRONG_SIZE, "a mesh may have %lld nodes; got more: use a coarser one", static_cast<long long>(MOST_NODES));
+      return refuse(m, ECHOSPLINE_WRONG_SIZE, "a mesh may have %lld nodes; got more: use a coarser one",
+                    static_cast<long long>(MOST_NODES));
   }
   if (o.stiffness_count != (o.stiffness ? nodes : 0))
-    return refuse(m, ECHOSPLINE_WRONG_SIZE, "stiffness needs one number per mesh node, %lld; got %lld", static_cast<long long>(nodes),
-                  static_cast<long long>(o.stiffness_count));
+    return refuse(m, ECHOSPLINE_WRONG_SIZE, "stiffness needs one number per mesh node, %lld; got %lld",
+                  static_cast<long long>(nodes), static_cast<long long>(o.stiffness_count));
   for (int64_t i = 0; i < o.stiffness_count; ++i)
     if (!(o.stiffness[i] > 0))
-      return refuse(m, ECHOSPLINE_WRONG_VALUE, "every stiffness must be positive (or infinite); got %g", o.stiffness[i]);
+      return refuse(m, ECHOSPLINE_WRONG_VALUE, "every stiffness must be positive (or infinite); got %g",
+                    o.stiffness[i]);
   return ECHOSPLINE_OK;
 }
 
@@ -75,10 +82,12 @@ echospline_status check_choices(const echospline_scene_options& o, Message& m) {
                  {"plane", o.plane, ECHOSPLINE_PLANE_STRAIN}};
   for (const auto& choice : choices)
     if (choice.value < 0 || choice.value > choice.last)
-      return refuse(m, ECHOSPLINE_WRONG_VALUE, "%s must be a choice from 0 to %d; got %d", choice.name, choice.last, choice.value);
+      return refuse(m, ECHOSPLINE_WRONG_VALUE, "%s must be a choice from 0 to %d; got %d", choice.name, choice.last,
+                    choice.value);
   const uint32_t edges = o.dimension == 2 ? 15 : 63;
   if (o.clamped & ~edges)
-    return refuse(m, ECHOSPLINE_WRONG_VALUE, "clamped must be bits of ECHOSPLINE_LEFT ... in %d dimensions; got %u", o.dimension, o.clamped);
+    return refuse(m, ECHOSPLINE_WRONG_VALUE, "clamped must be bits of ECHOSPLINE_LEFT ... in %d dimensions; got %u",
+                  o.dimension, o.clamped);
   return ECHOSPLINE_OK;
 }
 
@@ -98,14 +107,17 @@ echospline_status check_numbers(const echospline_scene_options& o, Message& m) {
                           {"radius", o.radius, 1e-9, huge, "mm"}};
   for (const Range& r : ranges)
     if (!(r.value >= r.low && r.value <= r.high))
-      return refuse(m, ECHOSPLINE_WRONG_VALUE, "%s must be a number from %g to %g %s; got %g", r.name, r.low, r.high, r.unit, r.value);
+      return refuse(m, ECHOSPLINE_WRONG_VALUE, "%s must be a number from %g to %g %s; got %g", r.name, r.low, r.high,
+                    r.unit, r.value);
   return ECHOSPLINE_OK;
 }
 
 echospline_status check_clamped(const echospline_scene_options& o, Message& m) {
-  if (o.clamped_point_count < 0 || o.clamped_point_count > MOST_ANCHORS || (o.clamped_point_count > 0 && !o.clamped_points))
-    return refuse(m, ECHOSPLINE_WRONG_SIZE, "clamped_points must be 0 to %lld points; got %lld%s", static_cast<long long>(MOST_ANCHORS),
-                  static_cast<long long>(o.clamped_point_count), o.clamped_points ? "" : " and no pointer");
+  if (o.clamped_point_count < 0 || o.clamped_point_count > MOST_ANCHORS ||
+      (o.clamped_point_count > 0 && !o.clamped_points))
+    return refuse(m, ECHOSPLINE_WRONG_SIZE, "clamped_points must be 0 to %lld points; got %lld%s",
+                  static_cast<long long>(MOST_ANCHORS), static_cast<long long>(o.clamped_point_count),
+                  o.clamped_points ? "" : " and no pointer");
   for (int64_t i = 0; i < o.clamped_point_count; ++i)
     for (int d = 0; d < o.dimension; ++d) {
       const double x = o.clamped_points[i * o.dimension + d], last = o.origin[d] + (o.shape[d] - 1) * o.spacing[d];
@@ -123,10 +135,12 @@ echospline_status check_clamped(const echospline_scene_options& o, Message& m) {
   }
   const double per = o.kernel == ECHOSPLINE_ELASTIC ? o.dimension : 1;
   if (anchors * per > static_cast<double>(MOST_ANCHORS))
-    return refuse(m, ECHOSPLINE_WRONG_SIZE, "what is clamped may have %lld anchors (elastic: components); got %.0f: raise anchor_spacing",
+    return refuse(m, ECHOSPLINE_WRONG_SIZE,
+                  "what is clamped may have %lld anchors (elastic: components); got %.0f: raise anchor_spacing",
                   static_cast<long long>(MOST_ANCHORS), anchors * per);
   if (o.contact_room < 0 || o.contact_room > 1 << 20)
-    return refuse(m, ECHOSPLINE_WRONG_SIZE, "contact_room must be 0 to %d; got %lld", 1 << 20, static_cast<long long>(o.contact_room));
+    return refuse(m, ECHOSPLINE_WRONG_SIZE, "contact_room must be 0 to %d; got %lld", 1 << 20,
+                  static_cast<long long>(o.contact_room));
   return ECHOSPLINE_OK;
 }
 
@@ -148,8 +162,9 @@ bool finite(const double* v, int dimension) {
 
 echospline_status check_pose(const echospline_pose& pose, int dimension, Message& m) {
   if (!finite(pose.entry, dimension) || !finite(pose.tip, dimension))
-    return refuse(m, ECHOSPLINE_WRONG_VALUE, "entry and tip of a pose must be finite numbers in mm, below 1e9; got tip (%g, %g)",
-                  pose.tip[0], pose.tip[1]);
+    return refuse(m, ECHOSPLINE_WRONG_VALUE,
+                  "entry and tip of a pose must be finite numbers in mm, below 1e9; got tip (%g, %g)", pose.tip[0],
+                  pose.tip[1]);
   if (!(std::fabs(pose.speed) <= 1e9))
     return refuse(m, ECHOSPLINE_WRONG_VALUE, "speed of a pose must be a finite number in mm/s; got %g", pose.speed);
   if (!(pose.dt >= 0 && pose.dt <= 1e9))
@@ -161,12 +176,15 @@ echospline_status check_pose(const echospline_pose& pose, int dimension, Message
 echospline_status say(Message& message, echospline_status status) {
   if (status == ECHOSPLINE_OUT_OF_MEMORY) return refuse(message, status, "memory ran out; the state has not changed");
   if (status == ECHOSPLINE_NOT_SOLVED)
-    return refuse(message, status, "two landmarks lie too close together to be told apart; the state has not changed: thin them out");
+    return refuse(message, status,
+                  "two landmarks lie too close together to be told apart; the state has not changed: thin them out");
   return status;
 }
 
 echospline_status room_for(Message& message, const void* out, int64_t room, int64_t needed) {
-  if (!out) return refuse(message, ECHOSPLINE_NULL_POINTER, "an array for %lld numbers must be given; got NULL", static_cast<long long>(needed));
+  if (!out)
+    return refuse(message, ECHOSPLINE_NULL_POINTER, "an array for %lld numbers must be given; got NULL",
+                  static_cast<long long>(needed));
   if (room < needed)
     return refuse(message, ECHOSPLINE_WRONG_SIZE, "the array must have room for %lld numbers; got room for %lld",
                   static_cast<long long>(needed), static_cast<long long>(room));
@@ -231,7 +249,8 @@ echospline_status echospline_scene_create(const echospline_scene_options* option
   made.level = echospline::find_level(options->level);
   if (!made.level)
     return refuse(message, ECHOSPLINE_WRONG_VALUE, "level must be one that this processor has, at most %s; got %d (%s)",
-                  echospline_level_name(echospline_level_best()), options->level, echospline_level_name(options->level));
+                  echospline_level_name(echospline_level_best()), options->level,
+                  echospline_level_name(options->level));
   status = made.level->tissue->create_scene(*options, &made.self, &made.functions, message);
   if (status == ECHOSPLINE_OUT_OF_MEMORY) return refuse(message, status, "memory ran out while the scene was built");
   if (status == ECHOSPLINE_OK) made.counts = made.functions->counts(made.self);
@@ -244,7 +263,9 @@ void echospline_scene_destroy(echospline_scene* scene) {
   std::free(scene);
 }
 
-const char* echospline_scene_message(const echospline_scene* scene) { return scene ? scene->message.text : "the scene is NULL"; }
+const char* echospline_scene_message(const echospline_scene* scene) {
+  return scene ? scene->message.text : "the scene is NULL";
+}
 int32_t echospline_scene_level(const echospline_scene* scene) { return scene && scene->self ? scene->level->id : 0; }
 int64_t echospline_scene_node_count(const echospline_scene* scene) { return scene ? scene->counts.nodes : 0; }
 int64_t echospline_scene_anchor_count(const echospline_scene* scene) { return scene ? scene->counts.anchors : 0; }
@@ -253,7 +274,8 @@ int64_t echospline_scene_source_count(const echospline_scene* scene) { return sc
 echospline_status echospline_scene_anchors(echospline_scene* scene, double* anchors, int64_t count) {
   if (!scene) return ECHOSPLINE_NULL_POINTER;
   if (!scene->self) return ECHOSPLINE_FAILED_HANDLE;
-  const echospline_status status = room_for(scene->message, anchors, count, scene->counts.anchors * scene->counts.dimension);
+  const echospline_status status =
+      room_for(scene->message, anchors, count, scene->counts.anchors * scene->counts.dimension);
   if (status == ECHOSPLINE_OK) scene->functions->anchors(scene->self, anchors);
   return status;
 }
@@ -265,7 +287,8 @@ echospline_status echospline_scene_sources(echospline_scene* scene, int64_t* nod
   return status;
 }
 
-echospline_status echospline_follow(const echospline_pose* now, const echospline_command* command, echospline_pose* next) {
+echospline_status echospline_follow(const echospline_pose* now, const echospline_command* command,
+                                    echospline_pose* next) {
   if (!now || !command || !next) return ECHOSPLINE_NULL_POINTER;
   if (!finite(now->entry, 3) || !finite(now->tip, 3) || !finite(command->entry, 3) || !finite(command->tip, 3) ||
       !(command->lag >= 0) || !(command->fastest > 0) || !(next->dt > 0 && next->dt <= 1e9))
@@ -279,10 +302,12 @@ echospline_status echospline_tissue_create(const echospline_scene* scene, echosp
   if (!*tissue) return ECHOSPLINE_OUT_OF_MEMORY;
   echospline_tissue& made = **tissue;
   if (!scene) return refuse(made.message, ECHOSPLINE_NULL_POINTER, "a scene must be given; got NULL");
-  if (!scene->self) return refuse(made.message, ECHOSPLINE_FAILED_HANDLE, "the scene's create had failed: %.300s", scene->message.text);
+  if (!scene->self)
+    return refuse(made.message, ECHOSPLINE_FAILED_HANDLE, "the scene's create had failed: %.300s", scene->message.text);
   made.scene = scene, made.functions = scene->functions->tissue;
   made.self = scene->functions->create_tissue(scene->self);
-  return made.self ? ECHOSPLINE_OK : refuse(made.message, ECHOSPLINE_OUT_OF_MEMORY, "memory ran out while the tissue was built");
+  return made.self ? ECHOSPLINE_OK
+                   : refuse(made.message, ECHOSPLINE_OUT_OF_MEMORY, "memory ran out while the tissue was built");
 }
 
 void echospline_tissue_destroy(echospline_tissue* tissue) {
@@ -312,12 +337,14 @@ echospline_status echospline_advance(echospline_tissue* t, const echospline_pose
 
 echospline_status echospline_displacement(echospline_tissue* t, double* out, int64_t count) {
   echospline_status status = usable(t);
-  if (status == ECHOSPLINE_OK) status = room_for(t->message, out, count, t->scene->counts.nodes * t->scene->counts.dimension);
+  if (status == ECHOSPLINE_OK)
+    status = room_for(t->message, out, count, t->scene->counts.nodes * t->scene->counts.dimension);
   return status == ECHOSPLINE_OK ? say(t->message, t->functions->displacement(t->self, out)) : status;
 }
 echospline_status echospline_displacement_single(echospline_tissue* t, float* out, int64_t count) {
   echospline_status status = usable(t);
-  if (status == ECHOSPLINE_OK) status = room_for(t->message, out, count, t->scene->counts.nodes * t->scene->counts.dimension);
+  if (status == ECHOSPLINE_OK)
+    status = room_for(t->message, out, count, t->scene->counts.nodes * t->scene->counts.dimension);
   return status == ECHOSPLINE_OK ? say(t->message, t->functions->displacement_single(t->self, out)) : status;
 }
 
@@ -326,22 +353,26 @@ echospline_status echospline_displacement_at(echospline_tissue* t, const double*
   if (status != ECHOSPLINE_OK) return status;
   const int dimension = t->scene->counts.dimension;
   if (count < 0 || count > INT64_MAX / 64)
-    return refuse(t->message, ECHOSPLINE_WRONG_SIZE, "point_count must be zero or positive; got %lld", static_cast<long long>(count));
-  if (count > 0 && (!points || !out)) return refuse(t->message, ECHOSPLINE_NULL_POINTER, "points and displacement must be given; got NULL");
+    return refuse(t->message, ECHOSPLINE_WRONG_SIZE, "point_count must be zero or positive; got %lld",
+                  static_cast<long long>(count));
+  if (count > 0 && (!points || !out))
+    return refuse(t->message, ECHOSPLINE_NULL_POINTER, "points and displacement must be given; got NULL");
   for (int64_t i = 0; i < count; ++i)
     if (!finite(points + i * dimension, dimension))
-      return refuse(t->message, ECHOSPLINE_WRONG_VALUE, "points must be finite numbers in mm, below 1e9; point %lld is not",
-                    static_cast<long long>(i));
+      return refuse(t->message, ECHOSPLINE_WRONG_VALUE,
+                    "points must be finite numbers in mm, below 1e9; point %lld is not", static_cast<long long>(i));
   return count ? say(t->message, t->functions->displacement_at(t->self, points, count, out)) : ECHOSPLINE_OK;
 }
 
-echospline_status echospline_landmarks(echospline_tissue* t, echospline_landmark* landmarks, int64_t room, int64_t* count) {
+echospline_status echospline_landmarks(echospline_tissue* t, echospline_landmark* landmarks, int64_t room,
+                                       int64_t* count) {
   const echospline_status status = usable(t);
   if (status != ECHOSPLINE_OK) return status;
   if (!count) return refuse(t->message, ECHOSPLINE_NULL_POINTER, "count must be given; got NULL");
   if (room < 0 || (room > 0 && !landmarks))
-    return refuse(t->message, ECHOSPLINE_WRONG_SIZE, "room must be the number of landmarks that the array holds; got %lld%s",
-                  static_cast<long long>(room), landmarks ? "" : " and no pointer");
+    return refuse(t->message, ECHOSPLINE_WRONG_SIZE,
+                  "room must be the number of landmarks that the array holds; got %lld%s", static_cast<long long>(room),
+                  landmarks ? "" : " and no pointer");
   *count = t->functions->landmarks(t->self, landmarks, room);
   return ECHOSPLINE_OK;
 }
@@ -357,7 +388,9 @@ echospline_status echospline_tissue_statistics(echospline_tissue* t, echospline_
   return ECHOSPLINE_OK;
 }
 
-int64_t echospline_state_size(const echospline_tissue* t) { return t && t->self ? t->functions->state_size(t->self) : 0; }
+int64_t echospline_state_size(const echospline_tissue* t) {
+  return t && t->self ? t->functions->state_size(t->self) : 0;
+}
 
 echospline_status echospline_state_save(echospline_tissue* t, void* bytes, int64_t size) {
   echospline_status status = usable(t);

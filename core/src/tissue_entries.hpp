@@ -39,8 +39,8 @@ struct SceneFunctions {
 };
 
 struct TissueEntries {
-  echospline_status (*create_scene)(const echospline_scene_options& options, void** scene, const SceneFunctions** functions,
-                                    Message& message);
+  echospline_status (*create_scene)(const echospline_scene_options& options, void** scene,
+                                    const SceneFunctions** functions, Message& message);
   echospline_status (*follow)(const echospline_pose& now, const echospline_command& command, echospline_pose& next);
 };
 

@@ -104,7 +104,8 @@ struct Kind {
         continue;
       }
       const Contact<D>& contact = state.contacts[j];
-      put(mark.place, own.scene.source[contact.source]), put(mark.displacement, contact.q), put(mark.grip, contact.grip);
+      put(mark.place, own.scene.source[contact.source]), put(mark.displacement, contact.q),
+          put(mark.grip, contact.grip);
       mark.along = contact.along, mark.node = own.scene.lattice.node[contact.source];
       mark.kind = contact.touching ? ECHOSPLINE_CONTACT : ECHOSPLINE_LEAVING;
     }
@@ -149,7 +150,8 @@ struct Kind {
   }
 
   static echospline_status refuse(Message& message, const char* why) {
-    std::snprintf(message.text, sizeof message.text, "a state must be bytes that echospline_state_save wrote for this scene; %s", why);
+    std::snprintf(message.text, sizeof message.text,
+                  "a state must be bytes that echospline_state_save wrote for this scene; %s", why);
     return ECHOSPLINE_WRONG_STATE;
   }
   static bool finite(const double (&v)[3]) { return std::isfinite(v[0]) && std::isfinite(v[1]) && std::isfinite(v[2]); }
@@ -160,24 +162,28 @@ struct Kind {
     StateHeader header;
     if (size < static_cast<int64_t>(sizeof header + sizeof(uint64_t))) return refuse(message, "these are too few");
     std::memcpy(&header, p, sizeof header);
-    if (std::memcmp(header.magic, STATE_MAGIC, sizeof header.magic) != 0) return refuse(message, "these begin differently");
+    if (std::memcmp(header.magic, STATE_MAGIC, sizeof header.magic) != 0)
+      return refuse(message, "these begin differently");
     if (header.version != STATE_VERSION) return refuse(message, "these are of another version: save the state again");
     const int64_t K = own.scene.sources(), count = header.count;
     if (count < 0 || count > K ||
-        size != static_cast<int64_t>(sizeof header + sizeof(uint64_t)) + count * static_cast<int64_t>(sizeof(StateContact)))
+        size !=
+            static_cast<int64_t>(sizeof header + sizeof(uint64_t)) + count * static_cast<int64_t>(sizeof(StateContact)))
       return refuse(message, "their number does not fit the contacts that they announce");
     uint64_t sum;
     std::memcpy(&sum, p + size - sizeof sum, sizeof sum);
     if (sum != checksum(bytes, size - static_cast<int64_t>(sizeof sum))) return refuse(message, "these are damaged");
     if (header.dimension != D || header.fingerprint != own.scene.fingerprint)
       return refuse(message, "these belong to a scene with another mesh, clamped edges or parameters");
-    if (!finite(header.place) || !finite(header.q) || !finite(header.entry) || !finite(header.tip_at) || header.tip < 0 || header.tip > 2)
+    if (!finite(header.place) || !finite(header.q) || !finite(header.entry) || !finite(header.tip_at) ||
+        header.tip < 0 || header.tip > 2)
       return refuse(message, "a number in these is out of its range");
     int32_t last = -1;
     for (int64_t j = 0; j < count; ++j) {
       StateContact saved;
       std::memcpy(&saved, p + sizeof header + j * sizeof saved, sizeof saved);
-      if (saved.source <= last || saved.source >= K || !finite(saved.q) || !finite(saved.grip) || !std::isfinite(saved.along))
+      if (saved.source <= last || saved.source >= K || !finite(saved.q) || !finite(saved.grip) ||
+          !std::isfinite(saved.along))
         return refuse(message, "a contact in these is out of its range");
       last = saved.source;
     }
@@ -194,18 +200,9 @@ struct Kind {
     }));
   }
 
-  static constexpr TissueFunctions tissue_functions = {destroy_tissue,
-                                                       reset,
-                                                       advance,
-                                                       displacement<double>,
-                                                       displacement<float>,
-                                                       displacement_at,
-                                                       planes,
-                                                       landmarks,
-                                                       statistics,
-                                                       state_size,
-                                                       state_save,
-                                                       state_load};
+  static constexpr TissueFunctions tissue_functions = {
+      destroy_tissue, reset,     advance,    displacement<double>, displacement<float>, displacement_at,
+      planes,         landmarks, statistics, state_size,           state_save,          state_load};
 
   // -- scene
 
@@ -220,7 +217,8 @@ struct Kind {
   static void anchors(const void* s, double* out) {
     const SceneOf& own = scene(s);
     for (int64_t i = 0; i < own.anchored.anchors; ++i)
-      for (int d = 0; d < D; ++d) out[i * D + d] = own.anchored.place[d][i] * own.anchored.scale + own.anchored.centre[d];
+      for (int d = 0; d < D; ++d)
+        out[i * D + d] = own.anchored.place[d][i] * own.anchored.scale + own.anchored.centre[d];
   }
   static void sources(const void* s, int64_t* out) {
     for (int64_t i = 0; i < scene(s).sources(); ++i) out[i] = scene(s).lattice.node[i];
@@ -233,7 +231,8 @@ struct Kind {
     }
     return made;
   }
-  static constexpr SceneFunctions scene_functions = {destroy_scene, counts, anchors, sources, create_tissue, &tissue_functions};
+  static constexpr SceneFunctions scene_functions = {destroy_scene, counts,        anchors,
+                                                     sources,       create_tissue, &tissue_functions};
 
   template <class Kernel>
   static KernelOf<D> kernel_for(const echospline_scene_options& o, double scale) {
@@ -246,27 +245,29 @@ struct Kind {
     return o.kernel == ECHOSPLINE_THIN_PLATE ? create_field<D, ThinPlate<D>, Real> : create_field<D, Elastic<D>, Real>;
   }
 
-  static echospline_status create_scene(const echospline_scene_options& o, void** out, const SceneFunctions** functions, Message& message) {
-    typename SceneOf::FieldFor make_field = field_for<float>(o);
-    if (o.precision == ECHOSPLINE_DOUBLE) {
-#ifdef ECHOSPLINE_SINGLE_ONLY
-      std::snprintf(message.text, sizeof message.text,
-                    "precision must be single in this build of the core; got double: use another build");
-      return ECHOSPLINE_WRONG_VALUE;
-#else
-      make_field = field_for<double>(o);
-#endif
-    }
+  static echospline_status create_scene(const echospline_scene_options& o, void** out, const SceneFunctions** functions,
+                                        Message& message) {
+    typename SceneOf::FieldFor make_field =
+        o.precision == ECHOSPLINE_SINGLE ? field_for<float>(o) : field_for<double>(o);
     SceneOf* made = create<SceneOf>();
     if (!made) return ECHOSPLINE_OUT_OF_MEMORY;
     for (int d = 0; d < D; ++d) {
       made->grid.shape[d] = o.shape[d], made->grid.spacing[d] = o.spacing[d], made->grid.origin[d] = o.origin[d];
       made->clamps.low[d] = (o.clamped >> (2 * d) & 1) != 0, made->clamps.high[d] = (o.clamped >> (2 * d + 1) & 1) != 0;
     }
-    bool there = made->clamps.points.reserve(o.clamped_point_count) && made->stiffness.reserve(o.stiffness ? made->grid.size() : 0);
-    for (int64_t i = 0; there && i < o.clamped_point_count; ++i) made->clamps.points[i] = point_of<D>(o.clamped_points + i * D);
+    bool there = made->clamps.points.reserve(o.clamped_point_count) &&
+                 made->stiffness.reserve(o.stiffness ? made->grid.size() : 0);
+    for (int64_t i = 0; there && i < o.clamped_point_count; ++i)
+      made->clamps.points[i] = point_of<D>(o.clamped_points + i * D);
     for (int64_t i = 0; there && i < made->stiffness.size(); ++i) made->stiffness[i] = o.stiffness[i];
-    made->interaction = {o.sigma,  o.delta, o.alpha1, o.alpha2, o.alpha3, o.length, o.drag, o.loading == ECHOSPLINE_IMMEDIATE,
+    made->interaction = {o.sigma,
+                         o.delta,
+                         o.alpha1,
+                         o.alpha2,
+                         o.alpha3,
+                         o.length,
+                         o.drag,
+                         o.loading == ECHOSPLINE_IMMEDIATE,
                          o.tip == ECHOSPLINE_TIP_NODE};
     made->contact_room = o.contact_room > 0 ? o.contact_room : FIRST_ROOM;
     made->fingerprint = fingerprint(o);
@@ -283,7 +284,8 @@ struct Kind {
     destroy(made);
     if (outcome == SceneOf::no_memory) return ECHOSPLINE_OUT_OF_MEMORY;
     std::snprintf(message.text, sizeof message.text,
-                  "the %lld anchors along what is clamped must determine the field; they lie on one %s or are too few: clamp another edge",
+                  "the %lld anchors along what is clamped must determine the field; they lie on one %s or are too few: "
+                  "clamp another edge",
                   static_cast<long long>(count), D == 2 ? "line" : "plane");
     return ECHOSPLINE_NOT_HELD;
   }
@@ -302,8 +304,10 @@ struct Kind {
   }
 };
 
-echospline_status create_scene(const echospline_scene_options& o, void** scene, const SceneFunctions** functions, Message& message) {
-  return o.dimension == 2 ? Kind<2>::create_scene(o, scene, functions, message) : Kind<3>::create_scene(o, scene, functions, message);
+echospline_status create_scene(const echospline_scene_options& o, void** scene, const SceneFunctions** functions,
+                               Message& message) {
+  return o.dimension == 2 ? Kind<2>::create_scene(o, scene, functions, message)
+                          : Kind<3>::create_scene(o, scene, functions, message);
 }
 
 echospline_status follow_command(const echospline_pose& now, const echospline_command& command, echospline_pose& next) {

@@ -69,14 +69,14 @@ inline bool invert(double* A, int64_t n, int64_t ld, int64_t* pivots) {
 /// anchor is less that of its parent.
 template <int D>
 struct AnchoredKernel {
-  KernelOf<D> kernel;  ///< in conditioned coordinates (x - centre) / scale
-  int c = 1;           ///< components of the kernel
-  Vec<D> centre;       ///< mm
-  double scale = 1;    ///< mm
-  int64_t anchors = 0;  ///< b
-  int64_t order = 0;    ///< m = b c + motions
-  int64_t ld = 0;       ///< m rounded up to ROW
-  int64_t padded = 0;   ///< b rounded up to ROW
+  KernelOf<D> kernel;      ///< in conditioned coordinates (x - centre) / scale
+  int c = 1;               ///< components of the kernel
+  Vec<D> centre;           ///< mm
+  double scale = 1;        ///< mm
+  int64_t anchors = 0;     ///< b
+  int64_t order = 0;       ///< m = b c + motions
+  int64_t ld = 0;          ///< m rounded up to ROW
+  int64_t padded = 0;      ///< b rounded up to ROW
   Array<double> place[D];  ///< conditioned anchors, (padded)
   Array<int32_t> parent;   ///< of every anchor, before it; -1 for the first
   Array<double> inverse;   ///< L_B^-1, (m, ld)
@@ -137,18 +137,21 @@ struct AnchoredKernel {
     }
     scale = extent > 0 ? extent / 2 : 1;
     kernel = kernel_for(scale);
-    c = kernel.components, order = count * c + kernel.motions, ld = rounded_up(order, ROW), padded = rounded_up(count, ROW);
+    c = kernel.components, order = count * c + kernel.motions, ld = rounded_up(order, ROW),
+    padded = rounded_up(count, ROW);
     for (int d = 0; d < D; ++d) {
       if (!place[d].reserve(padded)) return no_memory;
       for (int64_t i = 0; i < count; ++i) place[d][i] = conditioned(points[i])[d];
     }
     Array<int64_t> pivots;
     Array<double> row;
-    if (!inverse.reserve(order * ld) || !pivots.reserve(order) || !row.reserve(c * ld) || !find_parents(points)) return no_memory;
+    if (!inverse.reserve(order * ld) || !pivots.reserve(order) || !row.reserve(c * ld) || !find_parents(points))
+      return no_memory;
     for (int64_t i = 0; i < count; ++i) {
       felt(conditioned(points[i]), row.data());
       for (int a = 0; a < c; ++a) {
-        std::memcpy(inverse.data() + (a * count + i) * ld, row.data() + a * ld, static_cast<size_t>(order) * sizeof(double));
+        std::memcpy(inverse.data() + (a * count + i) * ld, row.data() + a * ld,
+                    static_cast<size_t>(order) * sizeof(double));
         for (int j = 0; j < kernel.motions; ++j)
           inverse[(count * c + j) * ld + a * count + i] = row[a * ld + count * c + j];
       }
@@ -156,7 +159,8 @@ struct AnchoredKernel {
     if (!motions_determined(row)) return not_held;
     // rows as differences, too
     for (int64_t a = 0; a < c; ++a)
-      for (int64_t i = count; i-- > 1;) add(&inverse[(a * count + i) * ld], -1, &inverse[(a * count + parent[i]) * ld], ld);
+      for (int64_t i = count; i-- > 1;)
+        add(&inverse[(a * count + i) * ld], -1, &inverse[(a * count + parent[i]) * ld], ld);
     for (int64_t j = count * c; j < order; ++j)
       for (int64_t a = 0; a < c; ++a)
         for (int64_t i = count; i-- > 1;) inverse[j * ld + a * count + i] -= inverse[j * ld + a * count + parent[i]];
@@ -195,7 +199,8 @@ struct AnchoredKernel {
         room[best * wide + i] = room[j * wide + i], room[j * wide + i] = t / length;
       }
       for (int l = j + 1; l < p; ++l)
-        add(room.data() + l * wide, -dot(room.data() + l * wide, room.data() + j * wide, wide), room.data() + j * wide, wide);
+        add(room.data() + l * wide, -dot(room.data() + l * wide, room.data() + j * wide, wide), room.data() + j * wide,
+            wide);
     }
     return true;
   }

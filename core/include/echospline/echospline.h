@@ -44,14 +44,14 @@ extern "C" {
 typedef int32_t echospline_status;
 enum {
   ECHOSPLINE_OK = 0,
-  ECHOSPLINE_NULL_POINTER = 1,     /* a pointer that must be given is NULL */
-  ECHOSPLINE_WRONG_SIZE = 2,       /* a struct_size, count or shape that does not fit */
-  ECHOSPLINE_WRONG_VALUE = 3,      /* a number out of its range or not finite, an unknown choice */
-  ECHOSPLINE_OUT_OF_MEMORY = 4,    /* nothing has changed */
-  ECHOSPLINE_NOT_HELD = 5,         /* what is clamped does not determine the field */
-  ECHOSPLINE_NOT_SOLVED = 6,       /* landmarks cannot be told apart; the state has not changed */
-  ECHOSPLINE_WRONG_STATE = 7,      /* bytes of another version or scene, or damaged */
-  ECHOSPLINE_FAILED_HANDLE = 8     /* the handle's create had failed: it only carries a message */
+  ECHOSPLINE_NULL_POINTER = 1,  /* a pointer that must be given is NULL */
+  ECHOSPLINE_WRONG_SIZE = 2,    /* a struct_size, count or shape that does not fit */
+  ECHOSPLINE_WRONG_VALUE = 3,   /* a number out of its range or not finite, an unknown choice */
+  ECHOSPLINE_OUT_OF_MEMORY = 4, /* nothing has changed */
+  ECHOSPLINE_NOT_HELD = 5,      /* what is clamped does not determine the field */
+  ECHOSPLINE_NOT_SOLVED = 6,    /* landmarks cannot be told apart; the state has not changed */
+  ECHOSPLINE_WRONG_STATE = 7,   /* bytes of another version or scene, or damaged */
+  ECHOSPLINE_FAILED_HANDLE = 8  /* the handle's create had failed: it only carries a message */
 };
 
 /* Name of a status, for logs; never NULL. */
@@ -63,12 +63,12 @@ ECHOSPLINE_API const char* echospline_status_text(echospline_status status);
 ECHOSPLINE_API uint32_t echospline_version(void);
 
 enum {
-  ECHOSPLINE_LEVEL_BEST = 0,       /* in options: what the processor has */
-  ECHOSPLINE_LEVEL_BASELINE = 1,   /* x86-64 with SSE2, or the plain level of another processor */
-  ECHOSPLINE_LEVEL_AVX2 = 2,       /* AVX2 and FMA */
-  ECHOSPLINE_LEVEL_AVX512 = 3,     /* AVX-512 F, BW, DQ, VL */
+  ECHOSPLINE_LEVEL_BEST = 0,     /* in options: what the processor has */
+  ECHOSPLINE_LEVEL_BASELINE = 1, /* x86-64 with SSE2, or the plain level of another processor */
+  ECHOSPLINE_LEVEL_AVX2 = 2,     /* AVX2 and FMA */
+  ECHOSPLINE_LEVEL_AVX512 = 3,   /* AVX-512 F, BW, DQ, VL */
   ECHOSPLINE_LEVEL_NEON = 4,
-  ECHOSPLINE_LEVEL_SIMD128 = 5     /* WebAssembly */
+  ECHOSPLINE_LEVEL_SIMD128 = 5 /* WebAssembly */
 };
 
 /* Best level that this library holds and this processor and system can run. */
@@ -80,48 +80,48 @@ ECHOSPLINE_API const char* echospline_level_name(int32_t level);
 
 /* ---- Scene -------------------------------------------------------------------------------------------------------- */
 
-enum { ECHOSPLINE_THIN_PLATE = 0, ECHOSPLINE_ELASTIC = 1 };          /* kernel */
-enum { ECHOSPLINE_SINGLE = 0, ECHOSPLINE_DOUBLE = 1 };               /* precision of the field */
-enum { ECHOSPLINE_TIP_POINT = 0, ECHOSPLINE_TIP_NODE = 1 };          /* landmark of the tip */
-enum { ECHOSPLINE_FOLLOW = 0, ECHOSPLINE_IMMEDIATE = 1 };            /* loading */
-enum { ECHOSPLINE_PLANE_STRESS = 0, ECHOSPLINE_PLANE_STRAIN = 1 };   /* elastic kernel in the plane */
-enum {                                                               /* clamped edges (2-D) or faces (3-D), bits */
-  ECHOSPLINE_LEFT = 1,    /* least x */
-  ECHOSPLINE_RIGHT = 2,
-  ECHOSPLINE_TOP = 4,     /* least y: at the probe */
-  ECHOSPLINE_BOTTOM = 8,
-  ECHOSPLINE_FRONT = 16,  /* least z, 3-D alone */
-  ECHOSPLINE_BACK = 32
+enum { ECHOSPLINE_THIN_PLATE = 0, ECHOSPLINE_ELASTIC = 1 };        /* kernel */
+enum { ECHOSPLINE_SINGLE = 0, ECHOSPLINE_DOUBLE = 1 };             /* precision of the field */
+enum { ECHOSPLINE_TIP_POINT = 0, ECHOSPLINE_TIP_NODE = 1 };        /* landmark of the tip */
+enum { ECHOSPLINE_FOLLOW = 0, ECHOSPLINE_IMMEDIATE = 1 };          /* loading */
+enum { ECHOSPLINE_PLANE_STRESS = 0, ECHOSPLINE_PLANE_STRAIN = 1 }; /* elastic kernel in the plane */
+enum {                                                             /* clamped edges (2-D) or faces (3-D), bits */
+       ECHOSPLINE_LEFT = 1,                                        /* least x */
+       ECHOSPLINE_RIGHT = 2,
+       ECHOSPLINE_TOP = 4, /* least y: at the probe */
+       ECHOSPLINE_BOTTOM = 8,
+       ECHOSPLINE_FRONT = 16, /* least z, 3-D alone */
+       ECHOSPLINE_BACK = 32
 };
 
 typedef struct echospline_scene_options {
   uint32_t struct_size;
-  int32_t dimension;         /* 2 or 3 */
-  int32_t kernel;            /* ECHOSPLINE_THIN_PLATE, equation (3), or ECHOSPLINE_ELASTIC */
+  int32_t dimension; /* 2 or 3 */
+  int32_t kernel;    /* ECHOSPLINE_THIN_PLATE, equation (3), or ECHOSPLINE_ELASTIC */
   int32_t precision;
   int32_t tip;
   int32_t loading;
   int32_t plane;
-  uint32_t clamped;          /* bits of ECHOSPLINE_LEFT ... */
+  uint32_t clamped; /* bits of ECHOSPLINE_LEFT ... */
   int32_t level;
-  int32_t shape[3];          /* nodes along x, y, z, 2 or more each */
-  double spacing[3];         /* mm */
-  double origin[3];          /* position of the first node, mm */
-  double sigma;              /* push of the tip, equation (12), mm */
-  double delta;              /* reach of friction around the shaft, equation (13), mm */
-  double alpha1, alpha2;     /* friction, equation (15), s */
-  double alpha3;             /* rate of relaxation, equation (16), 1/s */
-  double length;             /* length in the exponential of equation (15), mm */
-  double drag;               /* share of the shaft's sideways motion that contacts follow, 0 to 1 */
-  double contact_spacing;    /* distance between nodes that may become contacts, mm; 0: every node */
-  double anchor_spacing;     /* greatest distance between anchors along clamped edges, mm */
-  double poisson;            /* elastic kernel: Poisson's ratio */
-  double radius;             /* elastic kernel: regularisation length, mm */
-  const double* clamped_points;   /* (clamped_point_count, dimension) mm, or NULL */
+  int32_t shape[3];             /* nodes along x, y, z, 2 or more each */
+  double spacing[3];            /* mm */
+  double origin[3];             /* position of the first node, mm */
+  double sigma;                 /* push of the tip, equation (12), mm */
+  double delta;                 /* reach of friction around the shaft, equation (13), mm */
+  double alpha1, alpha2;        /* friction, equation (15), s */
+  double alpha3;                /* rate of relaxation, equation (16), 1/s */
+  double length;                /* length in the exponential of equation (15), mm */
+  double drag;                  /* share of the shaft's sideways motion that contacts follow, 0 to 1 */
+  double contact_spacing;       /* distance between nodes that may become contacts, mm; 0: every node */
+  double anchor_spacing;        /* greatest distance between anchors along clamped edges, mm */
+  double poisson;               /* elastic kernel: Poisson's ratio */
+  double radius;                /* elastic kernel: regularisation length, mm */
+  const double* clamped_points; /* (clamped_point_count, dimension) mm, or NULL */
   int64_t clamped_point_count;
-  const double* stiffness;   /* per mesh node, how firmly a landmark there holds its displacement; NULL: infinitely */
-  int64_t stiffness_count;   /* number of mesh nodes, or 0 */
-  int64_t contact_room;      /* contacts for which memory is reserved; 0 chooses. More are possible and allocate once. */
+  const double* stiffness; /* per mesh node, how firmly a landmark there holds its displacement; NULL: infinitely */
+  int64_t stiffness_count; /* number of mesh nodes, or 0 */
+  int64_t contact_room;    /* contacts for which memory is reserved; 0 chooses. More are possible and allocate once. */
 } echospline_scene_options;
 
 typedef struct echospline_scene echospline_scene;
@@ -131,14 +131,16 @@ typedef struct echospline_scene echospline_scene;
 ECHOSPLINE_API void echospline_scene_defaults(echospline_scene_options* options);
 
 /* Factor a scene. The arrays that options point to are copied. */
-ECHOSPLINE_API echospline_status echospline_scene_create(const echospline_scene_options* options, echospline_scene** scene);
-ECHOSPLINE_API void echospline_scene_destroy(echospline_scene* scene);  /* after all its tissues */
+ECHOSPLINE_API echospline_status echospline_scene_create(const echospline_scene_options* options,
+                                                         echospline_scene** scene);
+ECHOSPLINE_API void echospline_scene_destroy(echospline_scene* scene); /* after all its tissues */
 ECHOSPLINE_API const char* echospline_scene_message(const echospline_scene* scene);
 
 ECHOSPLINE_API int32_t echospline_scene_level(const echospline_scene* scene);
 ECHOSPLINE_API int64_t echospline_scene_node_count(const echospline_scene* scene);
 ECHOSPLINE_API int64_t echospline_scene_anchor_count(const echospline_scene* scene);
-ECHOSPLINE_API int64_t echospline_scene_source_count(const echospline_scene* scene);  /* nodes that may become contacts */
+ECHOSPLINE_API int64_t
+echospline_scene_source_count(const echospline_scene* scene); /* nodes that may become contacts */
 /* Anchors, (anchor_count, dimension) mm; count: numbers that there is room for. */
 ECHOSPLINE_API echospline_status echospline_scene_anchors(echospline_scene* scene, double* anchors, int64_t count);
 /* Mesh nodes that may become contacts, ascending. */
@@ -147,17 +149,17 @@ ECHOSPLINE_API echospline_status echospline_scene_sources(echospline_scene* scen
 /* ---- Needle ------------------------------------------------------------------------------------------------------- */
 
 typedef struct echospline_pose {
-  double entry[3];           /* n_s, mm */
-  double tip[3];             /* n_t, mm */
-  double speed;              /* of the tip along the axis relative to the entry, mm/s; negative on withdrawal */
-  double dt;                 /* time since the pose before, s, zero or more */
+  double entry[3]; /* n_s, mm */
+  double tip[3];   /* n_t, mm */
+  double speed;    /* of the tip along the axis relative to the entry, mm/s; negative on withdrawal */
+  double dt;       /* time since the pose before, s, zero or more */
 } echospline_pose;
 
 typedef struct echospline_command {
-  double entry[3];           /* where the needle shall go, mm */
+  double entry[3]; /* where the needle shall go, mm */
   double tip[3];
-  double lag;                /* time constant with which it follows, s; 0: at once */
-  double fastest;            /* upper limit of its speed, mm/s */
+  double lag;     /* time constant with which it follows, s; 0: at once */
+  double fastest; /* upper limit of its speed, mm/s */
 } echospline_command;
 
 /* Move a needle one step of next->dt seconds from now towards a command; fills entry, tip and speed of `next`. `next` may be `now`. */
@@ -168,19 +170,19 @@ ECHOSPLINE_API echospline_status echospline_follow(const echospline_pose* now, c
 
 typedef struct echospline_tissue echospline_tissue;
 
-enum {                       /* kind of a landmark that moves */
-  ECHOSPLINE_CONTACT = 0,    /* a node that touches the shaft */
-  ECHOSPLINE_LEAVING = 1,    /* a node that has left it and relaxes */
-  ECHOSPLINE_TIP = 2,        /* the tip, pushing */
-  ECHOSPLINE_TIP_LEFT = 3    /* where the tip was, relaxing */
+enum {                         /* kind of a landmark that moves */
+       ECHOSPLINE_CONTACT = 0, /* a node that touches the shaft */
+       ECHOSPLINE_LEAVING = 1, /* a node that has left it and relaxes */
+       ECHOSPLINE_TIP = 2,     /* the tip, pushing */
+       ECHOSPLINE_TIP_LEFT = 3 /* where the tip was, relaxing */
 };
 
 typedef struct echospline_landmark {
-  double place[3];           /* in the undeformed tissue, mm */
-  double displacement[3];    /* mm */
-  double grip[3];            /* of a contact: displacement across the axis less the shaft's position when it was touched, mm */
-  double along;              /* of a contact: where on the shaft it was touched, mm from the entry */
-  int64_t node;              /* mesh node; -1 for the tip */
+  double place[3];        /* in the undeformed tissue, mm */
+  double displacement[3]; /* mm */
+  double grip[3]; /* of a contact: displacement across the axis less the shaft's position when it was touched, mm */
+  double along;   /* of a contact: where on the shaft it was touched, mm from the entry */
+  int64_t node;   /* mesh node; -1 for the tip */
   int32_t kind;
   int32_t reserved;
 } echospline_landmark;
@@ -188,12 +190,12 @@ typedef struct echospline_landmark {
 typedef struct echospline_statistics {
   uint32_t struct_size;
   int32_t reserved;
-  int64_t steps;             /* since the tissue was created */
-  int64_t joined, left;      /* contacts */
-  int64_t rebuilt;           /* times the contacts' inverse was made anew because rounding had grown */
-  int64_t held_back;         /* steps since rest in which the landmarks were slowed down so that the picture does not jump */
-  int64_t allocations;       /* made by steps; 0 as long as the reserved room is enough */
-  double residual;           /* largest misfit at the landmarks seen, mm for displacements of 1 mm */
+  int64_t steps;        /* since the tissue was created */
+  int64_t joined, left; /* contacts */
+  int64_t rebuilt;      /* times the contacts' inverse was made anew because rounding had grown */
+  int64_t held_back;    /* steps since rest in which the landmarks were slowed down so that the picture does not jump */
+  int64_t allocations;  /* made by steps; 0 as long as the reserved room is enough */
+  double residual;      /* largest misfit at the landmarks seen, mm for displacements of 1 mm */
 } echospline_statistics;
 
 /* A tissue at rest. The scene must live longer. */
@@ -207,16 +209,19 @@ ECHOSPLINE_API echospline_status echospline_tissue_reset(echospline_tissue* tiss
 ECHOSPLINE_API echospline_status echospline_advance(echospline_tissue* tissue, const echospline_pose* pose);
 
 /* Displacement of the mesh nodes, (node_count, dimension) mm; count: numbers that there is room for. */
-ECHOSPLINE_API echospline_status echospline_displacement(echospline_tissue* tissue, double* displacement, int64_t count);
+ECHOSPLINE_API echospline_status echospline_displacement(echospline_tissue* tissue, double* displacement,
+                                                         int64_t count);
 /* The same in single precision. */
-ECHOSPLINE_API echospline_status echospline_displacement_single(echospline_tissue* tissue, float* displacement, int64_t count);
+ECHOSPLINE_API echospline_status echospline_displacement_single(echospline_tissue* tissue, float* displacement,
+                                                                int64_t count);
 /* Displacement of any reference points (point_count, dimension) mm, in the scene's precision. */
 ECHOSPLINE_API echospline_status echospline_displacement_at(echospline_tissue* tissue, const double* points,
                                                             int64_t point_count, double* displacement);
 /* Landmarks that move; `count` is set to their number, and no more than `room` are written. */
 ECHOSPLINE_API echospline_status echospline_landmarks(echospline_tissue* tissue, echospline_landmark* landmarks,
                                                       int64_t room, int64_t* count);
-ECHOSPLINE_API echospline_status echospline_tissue_statistics(echospline_tissue* tissue, echospline_statistics* statistics);
+ECHOSPLINE_API echospline_status echospline_tissue_statistics(echospline_tissue* tissue,
+                                                              echospline_statistics* statistics);
 
 /* ---- States as values --------------------------------------------------------------------------------------------- */
 
@@ -231,82 +236,82 @@ ECHOSPLINE_API echospline_status echospline_state_load(echospline_tissue* tissue
 /* A picture shows the reference image deformed, with a needle in it. A pixel has an area: tissue reaches half a pixel
  * beyond the mesh's outermost nodes, and beyond the reference's outermost centres its outermost pixels count. */
 
-enum { ECHOSPLINE_UINT8 = 0, ECHOSPLINE_UINT16 = 1, ECHOSPLINE_INT16 = 2, ECHOSPLINE_FLOAT32 = 3 };  /* pixel_type */
-enum { ECHOSPLINE_LINEAR = 0, ECHOSPLINE_NEAREST = 1 };                                              /* interpolation */
+enum { ECHOSPLINE_UINT8 = 0, ECHOSPLINE_UINT16 = 1, ECHOSPLINE_INT16 = 2, ECHOSPLINE_FLOAT32 = 3 }; /* pixel_type */
+enum { ECHOSPLINE_LINEAR = 0, ECHOSPLINE_NEAREST = 1 };                                             /* interpolation */
 enum {
-  ECHOSPLINE_BORDER_VALUE = 0,       /* border_value where no tissue comes to lie */
-  ECHOSPLINE_BORDER_TRANSPARENT = 1  /* red, green, blue and alpha are drawn; no needle outside tissue */
+  ECHOSPLINE_BORDER_VALUE = 0,      /* border_value where no tissue comes to lie */
+  ECHOSPLINE_BORDER_TRANSPARENT = 1 /* red, green, blue and alpha are drawn; no needle outside tissue */
 };
 enum {
-  ECHOSPLINE_METHOD_AUTO = 0,        /* the faster one that is good to 0.1 pixel: pull */
-  ECHOSPLINE_METHOD_EXACT = 1,       /* every pixel traced back in the cells of the mesh */
-  ECHOSPLINE_METHOD_PULL = 2         /* every fourth pixel and row, interpolated where that is good to 0.1 pixel */
+  ECHOSPLINE_METHOD_AUTO = 0,  /* the faster one that is good to 0.1 pixel: pull */
+  ECHOSPLINE_METHOD_EXACT = 1, /* every pixel traced back in the cells of the mesh */
+  ECHOSPLINE_METHOD_PULL = 2   /* every fourth pixel and row, interpolated where that is good to 0.1 pixel */
 };
 
 typedef struct echospline_picture_options {
   uint32_t struct_size;
   int32_t pixel_type;
-  int32_t channels;          /* 1 or 3 (interleaved) */
+  int32_t channels; /* 1 or 3 (interleaved) */
   int32_t interpolation;
   int32_t border;
   int32_t method;
   int32_t level;
-  int32_t columns, rows;     /* of the image */
-  int32_t mesh_shape[2];     /* nodes along x and y, 2 or more each */
+  int32_t columns, rows; /* of the image */
+  int32_t mesh_shape[2]; /* nodes along x and y, 2 or more each */
   int32_t reserved;
-  double spacing[2];         /* of the pixels, mm */
-  double origin[2];          /* centre of pixel (0, 0), mm */
-  double mesh_spacing[2];    /* mm */
-  double mesh_origin[2];     /* first node, mm */
+  double spacing[2];      /* of the pixels, mm */
+  double origin[2];       /* centre of pixel (0, 0), mm */
+  double mesh_spacing[2]; /* mm */
+  double mesh_origin[2];  /* first node, mm */
   double border_value;
-  double white;              /* grey level at which the display is white; 0: the largest of an integer type, or 1 */
+  double white; /* grey level at which the display is white; 0: the largest of an integer type, or 1 */
 } echospline_picture_options;
 
 enum {                       /* parts of a needle's echo, bits */
-  ECHOSPLINE_SHAFT = 1,      /* the line of its near wall */
-  ECHOSPLINE_BEVEL = 2,      /* tip and heel of the bevel */
-  ECHOSPLINE_TAIL = 4,       /* ring-down below a shaft that lies across the beam */
-  ECHOSPLINE_SHADOW = 8
+       ECHOSPLINE_SHAFT = 1, /* the line of its near wall */
+       ECHOSPLINE_BEVEL = 2, /* tip and heel of the bevel */
+       ECHOSPLINE_TAIL = 4,  /* ring-down below a shaft that lies across the beam */
+       ECHOSPLINE_SHADOW = 8
 };
 
 /* A needle and how its echo looks. Levels are dB of power relative to white; sigmas are of amplitude. */
 typedef struct echospline_needle {
   uint32_t struct_size;
-  uint32_t parts;            /* bits of ECHOSPLINE_SHAFT ... */
-  uint32_t seed;             /* of the grain, which is fixed to the needle */
-  int32_t curved;            /* 0: beams run along y; 1: away from the apex */
-  double entry[3], tip[3];   /* mm; the picture is the plane z = 0 */
-  double apex[2];            /* of a curved array, mm; its face is where the beams cross y = 0 below the apex */
-  double diameter;           /* mm */
-  double lateral, axial;     /* resolution across and along the beam: sigma, mm */
-  double elevation;          /* thickness of the slice at its focus: sigma, mm */
-  double elevation_depth;    /* of the focus, mm */
-  double element_height;     /* of the array across the plane, mm: the slice is thicker off its focus */
-  double f_number;           /* depth over aperture: penumbra of the shadow */
-  double dynamic_range;      /* of the display, dB */
-  double specular;           /* level of a shaft at right angles to the beam, before compounding, dB */
-  double lobe;               /* tilt at which that has fallen by 4.3 dB: in the plane, degrees */
-  double lobe_elevation;     /* and out of it */
-  double steering;           /* beams are compounded at 0 and plus and minus this, degrees; 0: no compounding */
-  double roughness;          /* level of the grain at any tilt, dB */
-  double rolloff;            /* its loss from 50 to 90 degrees of tilt, dB */
-  double wobble;             /* sd of the slow changes along the shaft, dB */
-  double patches;            /* sd of the grain's own, in patches of 1.5 mm, dB */
-  double bevel;              /* level of the tip, dB */
-  double ring_down;          /* first level of the tail relative to the specular echo, dB */
-  double ring_down_loss;     /* dB per mm */
-  double opacity;            /* share of a blocked ray that is lost, 0 to 1 */
+  uint32_t parts;          /* bits of ECHOSPLINE_SHAFT ... */
+  uint32_t seed;           /* of the grain, which is fixed to the needle */
+  int32_t curved;          /* 0: beams run along y; 1: away from the apex */
+  double entry[3], tip[3]; /* mm; the picture is the plane z = 0 */
+  double apex[2];          /* of a curved array, mm; its face is where the beams cross y = 0 below the apex */
+  double diameter;         /* mm */
+  double lateral, axial;   /* resolution across and along the beam: sigma, mm */
+  double elevation;        /* thickness of the slice at its focus: sigma, mm */
+  double elevation_depth;  /* of the focus, mm */
+  double element_height;   /* of the array across the plane, mm: the slice is thicker off its focus */
+  double f_number;         /* depth over aperture: penumbra of the shadow */
+  double dynamic_range;    /* of the display, dB */
+  double specular;         /* level of a shaft at right angles to the beam, before compounding, dB */
+  double lobe;             /* tilt at which that has fallen by 4.3 dB: in the plane, degrees */
+  double lobe_elevation;   /* and out of it */
+  double steering;         /* beams are compounded at 0 and plus and minus this, degrees; 0: no compounding */
+  double roughness;        /* level of the grain at any tilt, dB */
+  double rolloff;          /* its loss from 50 to 90 degrees of tilt, dB */
+  double wobble;           /* sd of the slow changes along the shaft, dB */
+  double patches;          /* sd of the grain's own, in patches of 1.5 mm, dB */
+  double bevel;            /* level of the tip, dB */
+  double ring_down;        /* first level of the tail relative to the specular echo, dB */
+  double ring_down_loss;   /* dB per mm */
+  double opacity;          /* share of a blocked ray that is lost, 0 to 1 */
 } echospline_needle;
 
 typedef struct echospline_picture_report {
   uint32_t struct_size;
-  int32_t method;            /* used: ECHOSPLINE_METHOD_EXACT or ECHOSPLINE_METHOD_PULL */
-  double residual;           /* largest distance of a checked pixel from the forward map of its origin, pixels */
-  double difference;         /* pull: bound of the distance of reference positions from the exact ones, pixels */
-  double exact_share;        /* of the lattice cells traced pixel by pixel; 1 with the exact method */
-  int64_t folded_cells;      /* of the mesh: the Jacobian determinant is not positive somewhere in them */
-  double smallest_jacobian;  /* over the mesh */
-  double place[2];           /* where that is, in the reference, mm */
+  int32_t method;           /* used: ECHOSPLINE_METHOD_EXACT or ECHOSPLINE_METHOD_PULL */
+  double residual;          /* largest distance of a checked pixel from the forward map of its origin, pixels */
+  double difference;        /* pull: bound of the distance of reference positions from the exact ones, pixels */
+  double exact_share;       /* of the lattice cells traced pixel by pixel; 1 with the exact method */
+  int64_t folded_cells;     /* of the mesh: the Jacobian determinant is not positive somewhere in them */
+  double smallest_jacobian; /* over the mesh */
+  double place[2];          /* where that is, in the reference, mm */
 } echospline_picture_report;
 
 typedef struct echospline_picture echospline_picture;

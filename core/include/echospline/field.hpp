@@ -5,7 +5,8 @@
 //
 // Weights of landmarks that stand close together are large and of both signs. So that single precision is enough, a column is kept as its
 // difference to that of the nearest landmark at the time it joined, its parent: an anchor, whose column is zero, or another contact, which
-// then carries its children's weights beside its own.
+// then carries its children's weights beside its own. Where kernels are evaluated directly, sums of groups of landmarks are compensated (Kahan),
+// and the thin plate in the plane, whose terms are far larger than their sum, is evaluated in double.
 #pragma once
 #include <new>
 
@@ -14,9 +15,11 @@
 
 namespace echospline::ECHOSPLINE_CORE {
 
-constexpr double CAREFUL = 35;  // weight times sum of anchors' shares beyond which a tip's column is computed in double, as its last digits
-                                // would be more than some 1e-6 mm of the field
-constexpr int VECTORS = 4;      // registers whose sums one pass over the landmarks fills
+constexpr double CAREFUL =
+    35;  // weight times sum of anchors' shares beyond which a tip's column is computed in double, as its last digits
+         // would be more than some 1e-6 mm of the field
+constexpr int64_t GROUP = 16;  // landmarks summed plainly before sums are compensated; more: less exact, fewer: slower
+constexpr int VECTORS = 4;     // registers whose sums one pass over the landmarks fills
 
 /// Points at which the field is wanted, as vectors read them: blocks of VECTORS registers, the last one filled up with the last point.
 template <int D, class Real>
@@ -72,9 +75,9 @@ class FieldScene : public SceneField<D> {
   const Scene<D>& scene;
   Kernel kernel;
   Points<D, Real> points;
-  Array<int64_t> at;    ///< which of the points every source is
-  Array<Real> mask;     ///< 1 at sources, else 0
-  Array<Real> table;    ///< in the plane: (blocks, order, c, block)
+  Array<int64_t> at;     ///< which of the points every source is
+  Array<Real> mask;      ///< 1 at sources, else 0
+  Array<Real> table;     ///< in the plane: (blocks, order, c, block)
   CoarseGrid<D> coarse;  ///< of a fine plane mesh
 
   explicit FieldScene(const Scene<D>& given)
@@ -142,6 +145,8 @@ class FieldOf : public SessionField<D> {
   static constexpr int64_t block = Points<D, Real>::block;
   typedef FieldScene<D, Kernel, Real> Given;
   typedef Vector<Real> V;
+  typedef std::conditional_t<D == 2 && c == 1, double, Real> Direct;  ///< in which kernels are evaluated directly
+  static constexpr int64_t direct_block = VECTORS * Lanes<Direct>::count;
 
   explicit FieldOf(const Given& given) : given_(given), points_(given.points), anchored_(given.scene.anchored) {}
 
@@ -157,17 +162,19 @@ class FieldOf : public SessionField<D> {
   }
 
   bool reserve(int64_t contacts, int64_t kept) override {
-    Array<Real> columns, weights, gathered;
+    Array<Real> columns, weights;
+    Array<Direct> gathered;
     Array<double> places, landmark_weights;
     const int64_t most = anchored_.anchors + contacts + 1 + Kernel::motions;
     if (!columns.reserve(keeps_columns ? points_.blocks * (contacts + 1) * c * planes_of * block : 0) ||
-        !weights.reserve(((contacts + 1) * c + anchored_.order) * D) || !gathered.reserve(most * 2 * D) || !places.reserve(most * D) ||
-        !landmark_weights.reserve(most * D))
+        !weights.reserve(((contacts + 1) * c + anchored_.order) * D) || !gathered.reserve(most * 2 * D) ||
+        !places.reserve(most * D) || !landmark_weights.reserve(most * D))
       return false;
     for (int64_t b = 0; keeps_columns && b < points_.blocks && kept; ++b)
       std::memcpy(&columns[b * (contacts + 1) * c * planes_of * block], column(b, 0),
                   static_cast<size_t>(kept * c * planes_of * block) * sizeof(Real));
-    columns_.swap(columns), weights_.swap(weights), gathered_.swap(gathered), places_.swap(places), landmark_weights_.swap(landmark_weights);
+    columns_.swap(columns), weights_.swap(weights), gathered_.swap(gathered), places_.swap(places),
+        landmark_weights_.swap(landmark_weights);
     room_ = contacts;
     return true;
   }
@@ -178,7 +185,8 @@ class FieldOf : public SessionField<D> {
     for (int64_t b = 0; keeps_columns && b < points_.blocks; ++b) {
       Real* child = column(b, to);
       const Real* own = column(b, from);
-      for (int64_t i = 0; i < c * planes_of * block; i += Lanes<Real>::count) store(child + i, load(child + i) + load(own + i));
+      for (int64_t i = 0; i < c * planes_of * block; i += Lanes<Real>::count)
+        store(child + i, load(child + i) + load(own + i));
     }
   }
   void move(int64_t from, int64_t to) override {
@@ -215,7 +223,7 @@ class FieldOf : public SessionField<D> {
   void evaluate(const LandmarkWeights<D>& landmarks, const double* points, int64_t count, double* out) override {
     evaluate_at(
         landmarks, count, [&](int64_t i) { return point_of<D>(points + i * D); },
-        [&](int64_t i, int d, Real u) { out[i * D + d] = static_cast<double>(u); });
+        [&](int64_t i, int d, Direct u) { out[i * D + d] = static_cast<double>(u); });
   }
   bool mesh_needs_landmarks() const override { return D == 3 || given_.scene.fine(); }
   void mesh(const LandmarkWeights<D>& landmarks, double* out) override { write_mesh(landmarks, out); }
@@ -237,21 +245,31 @@ class FieldOf : public SessionField<D> {
   const AnchoredKernel<D>& anchored_;
   Planes<D, Real> now_, next_, rest_;
   Array<Real> columns_;  ///< less the parent's, in the plane: (blocks, room + 1, c, planes, block); the last for a tip
-  Array<Real> weights_, gathered_;
+  Array<Real> weights_;
+  Array<Direct> gathered_;
   Array<double> places_, landmark_weights_, shares_;
   int64_t room_ = 0;
   struct NoFineField {};
   [[no_unique_address]] std::conditional_t<D == 2, FineField<Kernel, Real>, NoFineField> fine_;
 
-  Real* column(int64_t block_index, int64_t slot) { return columns_.data() + (block_index * (room_ + 1) + slot) * c * planes_of * block; }
-  const Real* table(int64_t block_index) const { return given_.table.data() + block_index * anchored_.order * c * block; }
+  Real* column(int64_t block_index, int64_t slot) {
+    return columns_.data() + (block_index * (room_ + 1) + slot) * c * planes_of * block;
+  }
+  const Real* table(int64_t block_index) const {
+    return given_.table.data() + block_index * anchored_.order * c * block;
+  }
 
   /// Mesh displacement in planes: the field itself, or the fine one from it.
-  const Planes<D, Real>& mesh_planes(const LandmarkWeights<D>& landmarks) {
+  __attribute__((noinline)) const Planes<D, Real>& mesh_planes(const LandmarkWeights<D>& landmarks) {
     if (!given_.scene.fine()) return now_;
     fine_.compute(now_.u[0].data(), now_.u[1].data());
-    const Real* p = gather(landmarks);
-    for (int64_t i = 0; i < landmarks.count; ++i, p += 2 * D) fine_.correct(p, p + D, given_.kernel, anchored_.centre, anchored_.scale);
+    const double* place = landmarks.place;
+    for (int64_t i = 0; i < landmarks.count; ++i, place += D) {
+      Real at[D], weight[D];
+      for (int d = 0; d < D; ++d)
+        at[d] = static_cast<Real>(place[d]), weight[d] = static_cast<Real>(landmarks.weight[i * D + d]);
+      fine_.correct(at, weight, given_.kernel, anchored_.centre, anchored_.scale);
+    }
     return fine_.field;
   }
   template <class Number>
@@ -264,12 +282,13 @@ class FieldOf : public SessionField<D> {
     } else {
       evaluate_at(
           landmarks, n, [&](int64_t i) { return given_.scene.grid.place(i); },
-          [&](int64_t i, int d, Real u) { out[i * D + d] = static_cast<Number>(u); });
+          [&](int64_t i, int d, Direct u) { out[i * D + d] = static_cast<Number>(u); });
     }
   }
 
   /// Store one block of a field and keep the largest squares at sources.
-  ECHOSPLINE_INLINE void finish_block(int64_t b, const V (&u)[D][VECTORS], Planes<D, Real>& out, V& change, V& reach) const {
+  ECHOSPLINE_INLINE void finish_block(int64_t b, const V (&u)[D][VECTORS], Planes<D, Real>& out, V& change,
+                                      V& reach) const {
     for (int v = 0; v < VECTORS; ++v) {
       const int64_t at = b * block + v * Lanes<Real>::count;
       V r2{}, d2{};
@@ -380,8 +399,10 @@ class FieldOf : public SessionField<D> {
     V to_p[D], to_q[D];
     for (int d = 0; d < D; ++d) {
       const V x = load(points_.x[d].data() + at);
-      const Real near_p = static_cast<Real>(p[d]), near_q = static_cast<Real>(q[d]);  // and what rounding has taken from them
-      to_p[d] = (x - near_p) - static_cast<Real>(p[d] - near_p), to_q[d] = (x - near_q) - static_cast<Real>(q[d] - near_q);
+      const Real near_p = static_cast<Real>(p[d]),
+                 near_q = static_cast<Real>(q[d]);  // and what rounding has taken from them
+      to_p[d] = (x - near_p) - static_cast<Real>(p[d] - near_p),
+      to_q[d] = (x - near_q) - static_cast<Real>(q[d] - near_q);
     }
     if constexpr (D == 2 && c == 1 && sizeof(Real) == 4) {
       V r2{}, other2{}, less{};
@@ -399,7 +420,8 @@ class FieldOf : public SessionField<D> {
     }
   }
   /// The tip's part of one block, relative to a landmark: (G_:p - G_:q) s.
-  ECHOSPLINE_INLINE void tip_block(int64_t b, const Vec<D>& p, const Vec<D>& q, const Real* h, const Real (&s)[D], V (&u)[D][VECTORS]) const {
+  ECHOSPLINE_INLINE void tip_block(int64_t b, const Vec<D>& p, const Vec<D>& q, const Real* h, const Real (&s)[D],
+                                   V (&u)[D][VECTORS]) const {
     constexpr int lanes = Lanes<Real>::count;
     V a[planes_of][VECTORS];
     for (int v = 0; v < VECTORS; ++v) {
@@ -425,78 +447,87 @@ class FieldOf : public SessionField<D> {
   // ---- Anywhere: kernels evaluated where the field is wanted ------------------------------------------------------------------------------
 
   Largest by_kernels(const Weights<D>& given, Planes<D, Real>& out) {
-    gather(given.landmarks);
-    V change{}, reach{};
-    for (int64_t b = 0; b < points_.blocks; ++b) {
-      Real x[D][block];
-      V u[D][VECTORS];
-      for (int d = 0; d < D; ++d) std::memcpy(x[d], points_.x[d].data() + b * block, sizeof x[d]);
-      evaluate_block(given.landmarks.count, x, u);
-      finish_block(b, u, out, change, reach);
+    if constexpr (!keeps_columns) {
+      gather(given.landmarks);
+      V change{}, reach{};
+      for (int64_t b = 0; b < points_.blocks; ++b) {
+        Real x[D][block];
+        V u[D][VECTORS];
+        for (int d = 0; d < D; ++d) std::memcpy(x[d], points_.x[d].data() + b * block, sizeof x[d]);
+        evaluate_block(given.landmarks.count, x, u);
+        finish_block(b, u, out, change, reach);
+      }
+      return {largest<Real>(change), largest<Real>(reach)};
     }
-    return {largest<Real>(change), largest<Real>(reach)};
+    return {};
   }
-  /// Landmarks in the field's precision: (place, weight) of each, then the motions' coefficients.
-  const Real* gather(const LandmarkWeights<D>& landmarks) {
+  /// Landmarks as the evaluation reads them: (place, weight) of each, then the motions' coefficients.
+  void gather(const LandmarkWeights<D>& landmarks) {
     for (int64_t i = 0; i < landmarks.count; ++i)
       for (int d = 0; d < D; ++d) {
-        gathered_[i * 2 * D + d] = static_cast<Real>(landmarks.place[i * D + d]);
-        gathered_[i * 2 * D + D + d] = static_cast<Real>(landmarks.weight[i * D + d]);
+        gathered_[i * 2 * D + d] = static_cast<Direct>(landmarks.place[i * D + d]);
+        gathered_[i * 2 * D + D + d] = static_cast<Direct>(landmarks.weight[i * D + d]);
       }
     for (int64_t j = 0; j < Kernel::motions * D; ++j)
-      gathered_[landmarks.count * 2 * D + j] = static_cast<Real>(landmarks.weight[landmarks.count * D + j]);
-    return gathered_.data();
+      gathered_[landmarks.count * 2 * D + j] = static_cast<Direct>(landmarks.weight[landmarks.count * D + j]);
   }
   template <class Place, class Put>
   void evaluate_at(const LandmarkWeights<D>& landmarks, int64_t count, Place place, Put put) {
-    constexpr int lanes = Lanes<Real>::count;
+    constexpr int lanes = Lanes<Direct>::count;
     if (landmarks.count) gather(landmarks);
-    for (int64_t first = 0; first < count; first += block) {
-      Real x[D][block];
-      for (int64_t i = 0; i < block; ++i) {
+    for (int64_t first = 0; first < count; first += direct_block) {
+      Direct x[D][direct_block];
+      for (int64_t i = 0; i < direct_block; ++i) {
         const Vec<D> p = anchored_.conditioned(place(smaller(first + i, count - 1)));
-        for (int d = 0; d < D; ++d) x[d][i] = static_cast<Real>(p[d]);
+        for (int d = 0; d < D; ++d) x[d][i] = static_cast<Direct>(p[d]);
       }
-      V u[D][VECTORS] = {};
+      Vector<Direct> u[D][VECTORS] = {};
       if (landmarks.count) evaluate_block(landmarks.count, x, u);
-      for (int64_t i = 0; i < smaller(block, count - first); ++i)
+      for (int64_t i = 0; i < smaller(direct_block, count - first); ++i)
         for (int d = 0; d < D; ++d) put(first + i, d, u[d][i / lanes][i % lanes]);
     }
   }
   /// Field of the gathered landmarks at one block of conditioned points.
-  __attribute__((noinline)) void evaluate_block(int64_t count, const Real (&points)[D][block], V (&u)[D][VECTORS]) const {
-    V x[D][VECTORS];
+  __attribute__((noinline)) void evaluate_block(int64_t count, const Direct (&points)[D][direct_block],
+                                                Vector<Direct> (&u)[D][VECTORS]) const {
+    typedef Vector<Direct> N;
+    N x[D][VECTORS];
     for (int d = 0; d < D; ++d)
-      for (int v = 0; v < VECTORS; ++v) x[d][v] = load(points[d] + v * Lanes<Real>::count);
-    const Real* a = gathered_.data() + count * 2 * D;
+      for (int v = 0; v < VECTORS; ++v) x[d][v] = load(points[d] + v * Lanes<Direct>::count);
+    const Direct* a = gathered_.data() + count * 2 * D;
     for (int d = 0; d < D; ++d)
       for (int v = 0; v < VECTORS; ++v) {
         if constexpr (c == 1) {
-          u[d][v] = all<Real>(a[d]);
+          u[d][v] = all<Direct>(a[d]);
           for (int e = 0; e < D; ++e) u[d][v] += a[(e + 1) * D + d] * x[e][v];
         } else if constexpr (D == 2) {
           u[d][v] = a[d * D] + (d == 0 ? -a[2 * D] : a[2 * D]) * x[1 - d][v];
         } else {
-          const Real about_z = a[3 * D], about_x = a[4 * D], about_y = a[5 * D];
+          const Direct about_z = a[3 * D], about_x = a[4 * D], about_y = a[5 * D];
           u[d][v] = a[d * D] + (d == 0   ? about_y * x[2][v] - about_z * x[1][v]
                                 : d == 1 ? about_z * x[0][v] - about_x * x[2][v]
                                          : about_x * x[1][v] - about_y * x[0][v]);
         }
       }
-    const Real* p = gathered_.data();
-    for (int64_t i = 0; i < count; ++i, p += 2 * D)
-      for (int v = 0; v < VECTORS; ++v) {
-        V offset[D], U[c][c];
-        for (int d = 0; d < D; ++d) offset[d] = x[d][v] - p[d];
-        given_.kernel.at(offset, U);
-        for (int d = 0; d < D; ++d) {
-          if constexpr (c == 1) {
-            u[d][v] += p[D + d] * U[0][0];
-          } else {
-            for (int e = 0; e < D; ++e) u[d][v] += p[D + e] * U[d][e];
-          }
+    N lost[D][VECTORS] = {};
+    for (int64_t first = 0; first < count; first += GROUP) {
+      N sum[D][VECTORS] = {};
+      const Direct* p = gathered_.data() + first * 2 * D;
+      const Direct* end = gathered_.data() + smaller(first + GROUP, count) * 2 * D;
+      for (; p < end; p += 2 * D)
+        for (int v = 0; v < VECTORS; ++v) {
+          N offset[D], own[D];
+          for (int d = 0; d < D; ++d) offset[d] = x[d][v] - p[d], own[d] = sum[d][v];
+          given_.kernel.respond(offset, p + D, own);
+          for (int d = 0; d < D; ++d) sum[d][v] = own[d];
         }
-      }
+      for (int d = 0; d < D; ++d)
+        for (int v = 0; v < VECTORS; ++v) {
+          const N more = sum[d][v] - lost[d][v], next = u[d][v] + more;
+          lost[d][v] = (next - u[d][v]) - more;
+          u[d][v] = next;
+        }
+    }
   }
 };
 

@@ -79,7 +79,8 @@ class FineField {
       for (int64_t i = 0; i < points; i += Lanes<Real>::count) {
         Vector<Real> offset[D] = {}, f[planes];
         for (int l = 0; l < Lanes<Real>::count; ++l)
-          offset[0][l] = static_cast<Real>(first[0] + (x0 + static_cast<double>(i + l - 1) * coarse_.stride[0]) * step[0]);
+          offset[0][l] =
+              static_cast<Real>(first[0] + (x0 + static_cast<double>(i + l - 1) * coarse_.stride[0]) * step[0]);
         offset[1] = all<Real>(static_cast<Real>(y));
         response(kernel, offset, weight, f);
         for (int d = 0; d < planes; ++d)
@@ -91,15 +92,17 @@ class FineField {
     for (int64_t y = begin[1]; y < end[1]; ++y) {
       const int64_t j = y / coarse_.stride[1] - j0;
       for (int d = 0; d < planes; ++d) {
-        const Real* const row[4] = {interpolated + (j * planes + d) * wide_, interpolated + ((j + 1) * planes + d) * wide_,
-                                    interpolated + ((j + 2) * planes + d) * wide_, interpolated + ((j + 3) * planes + d) * wide_};
+        const Real* const row[4] = {
+            interpolated + (j * planes + d) * wide_, interpolated + ((j + 1) * planes + d) * wide_,
+            interpolated + ((j + 2) * planes + d) * wide_, interpolated + ((j + 3) * planes + d) * wide_};
         along_y(taps_[1][y % coarse_.stride[1]], row, count, sum + d * wide_);
       }
       Vector<Real> offset[D] = {}, f[planes];
       offset[1] = all<Real>(static_cast<Real>(first[1] + static_cast<double>(y) * step[1]));
       for (int64_t x = 0; x < count; x += Lanes<Real>::count) {
         const Real start = static_cast<Real>(first[0] + static_cast<double>(x0 + x) * step[0]);
-        for (int l = 0; l < Lanes<Real>::count; ++l) offset[0][l] = start + static_cast<Real>(l) * static_cast<Real>(step[0]);
+        for (int l = 0; l < Lanes<Real>::count; ++l)
+          offset[0][l] = start + static_cast<Real>(l) * static_cast<Real>(step[0]);
         response(kernel, offset, weight, f);
         for (int d = 0; d < planes; ++d) store(sum + d * wide_ + x, f[d] - load(sum + d * wide_ + x));
       }
@@ -118,7 +121,8 @@ class FineField {
   };
   Grid<D> fine_;
   CoarseGrid<D> coarse_;
-  Array<Taps> taps_[D];  ///< weights of the four coarse points around each place in a coarse cell (Lagrange, exact for cubics)
+  Array<Taps>
+      taps_[D];  ///< weights of the four coarse points around each place in a coarse cell (Lagrange, exact for cubics)
   Array<Real> rows_;
   int64_t wide_ = 0;
 
@@ -127,7 +131,8 @@ class FineField {
     for (int d = 0; d < D; ++d)
       for (int32_t i = 0; i < coarse_.stride[d]; ++i) {
         const double t = static_cast<double>(i) / coarse_.stride[d];
-        taps_[d][i] = {{static_cast<Real>(-t * (t - 1) * (t - 2) / 6), static_cast<Real>((t + 1) * (t - 1) * (t - 2) / 2),
+        taps_[d][i] = {{static_cast<Real>(-t * (t - 1) * (t - 2) / 6),
+                        static_cast<Real>((t + 1) * (t - 1) * (t - 2) / 2),
                         static_cast<Real>(-(t + 1) * t * (t - 2) / 2), static_cast<Real>((t + 1) * t * (t - 1) / 6)}};
       }
     return true;
@@ -143,7 +148,8 @@ class FineField {
       }
   }
   static void along_y(const Taps& t, const Real* const (&row)[4], int64_t count, Real* out) {
-    for (int64_t x = 0; x < count; ++x) out[x] = t.w[0] * row[0][x] + t.w[1] * row[1][x] + t.w[2] * row[2][x] + t.w[3] * row[3][x];
+    for (int64_t x = 0; x < count; ++x)
+      out[x] = t.w[0] * row[0][x] + t.w[1] * row[1][x] + t.w[2] * row[2][x] + t.w[3] * row[3][x];
   }
 
   void interpolate(const Real* coarse_field, int d) {
@@ -152,15 +158,16 @@ class FineField {
     for (int64_t y = 0; y < ny; ++y) {
       const int64_t j = y / coarse_.stride[1];
       for (; next < j + 4; ++next) along_x(coarse_field + next * mx, nx, rows_.data() + next % 4 * wide_);
-      const Real* const row[4] = {rows_.data() + j % 4 * wide_, rows_.data() + (j + 1) % 4 * wide_, rows_.data() + (j + 2) % 4 * wide_,
-                                  rows_.data() + (j + 3) % 4 * wide_};
+      const Real* const row[4] = {rows_.data() + j % 4 * wide_, rows_.data() + (j + 1) % 4 * wide_,
+                                  rows_.data() + (j + 2) % 4 * wide_, rows_.data() + (j + 3) % 4 * wide_};
       along_y(taps_[1][y % coarse_.stride[1]], row, nx, field.u[d].data() + y * nx);
     }
   }
 
   /// Kernel times weight at an offset.
   template <class Number>
-  ECHOSPLINE_INLINE static void response(const Kernel& kernel, const Number (&offset)[D], const Real* weight, Number (&f)[planes]) {
+  ECHOSPLINE_INLINE static void response(const Kernel& kernel, const Number (&offset)[D], const Real* weight,
+                                         Number (&f)[planes]) {
     Number U[c][c];
     kernel.at(offset, U);
     for (int d = 0; d < planes; ++d) {
@@ -170,7 +177,6 @@ class FineField {
         f[d] = U[d][0] * weight[0] + U[d][1] * weight[1];
     }
   }
-
 };
 
 }  // namespace echospline::ECHOSPLINE_CORE

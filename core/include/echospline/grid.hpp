@@ -140,7 +140,8 @@ struct ContactLattice {
       places *= lines[d];
     }
     if (!source.reserve(places)) return false;
-    for (int64_t j = 0; j < places; ++j) source[j] = clamps.hold(grid, mesh_node(grid, j)) ? -1 : static_cast<int32_t>(count++);
+    for (int64_t j = 0; j < places; ++j)
+      source[j] = clamps.hold(grid, mesh_node(grid, j)) ? -1 : static_cast<int32_t>(count++);
     if (!node.reserve(count)) return false;
     for (int64_t j = 0; j < places; ++j)
       if (source[j] >= 0) node[source[j]] = mesh_node(grid, j);

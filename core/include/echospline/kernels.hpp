@@ -13,12 +13,13 @@ constexpr double PI = 3.14159265358979323846;
 
 ECHOSPLINE_INLINE double logarithm(double x) { return x > 0 ? std::log(x) : 0.0; }
 ECHOSPLINE_INLINE double root(double x) { return std::sqrt(x); }
+ECHOSPLINE_INLINE double inverse_root(double x) { return 1 / std::sqrt(x); }
 
 /// U(r) = r^2 ln r^2 in the plane, equation (3), and -r in space; one scalar serves all components, with the affine motions of equation (5).
 template <int D>
 struct ThinPlate {
   static constexpr int components = 1;
-  static constexpr int motions = D + 1;              ///< polynomials
+  static constexpr int motions = D + 1;                ///< polynomials
   static constexpr int length_power = D == 2 ? 2 : 1;  ///< of the kernel's values
   static constexpr double per_spring = D == 2 ? 16 * PI : 8 * PI;
 
@@ -33,6 +34,13 @@ struct ThinPlate {
       U[0][0] = r2 * logarithm(r2);
     else
       U[0][0] = -root(r2);
+  }
+  /// Add U at an offset times a weight.
+  template <class Number, class Real>
+  ECHOSPLINE_INLINE void respond(const Number (&offset)[D], const Real* weight, Number (&u)[D]) const {
+    Number U[1][1];
+    at(offset, U);
+    for (int d = 0; d < D; ++d) u[d] += weight[d] * U[0][0];
   }
   /// U at squared distance r2 less U at other2 in the plane, single precision; `less` is the difference of the two. Accurate to the last digits of the difference, where each U is much larger.
   template <class Number>
@@ -67,21 +75,22 @@ struct Elastic {
 
   template <class Number>
   ECHOSPLINE_INLINE void at(const Number (&offset)[D], Number (&U)[D][D]) const {
-    typedef std::remove_cvref_t<decltype(scalar(offset[0]))> Real;
-    const Real c = static_cast<Real>(coupling), e2 = static_cast<Real>(radius2);
-    Number r2 = offset[0] * offset[0];
-    for (int d = 1; d < D; ++d) r2 += offset[d] * offset[d];
-    const Number s = r2 + e2, per = Real(1) / s;
-    if constexpr (D == 2) {
-      const Number own = (Real(2) * c - Real(4)) * (logarithm(s) + Real(1)) - Real(4) * r2 * per, both = Real(4) * c * per;
-      for (int a = 0; a < D; ++a)
-        for (int b = 0; b < D; ++b) U[a][b] = both * offset[a] * offset[b] + (a == b ? own : own * Real(0));
-    } else {
-      const Number p = root(per), p3 = p * per;  // 1 / r_e, 1 / r_e^3
-      const Number own = (Real(4) - c) * p + Real(2) * e2 * p3, both = c * p3;
-      for (int a = 0; a < D; ++a)
-        for (int b = 0; b < D; ++b) U[a][b] = both * offset[a] * offset[b] + (a == b ? own : own * Real(0));
-    }
+    Number own, both;
+    parts(offset, own, both);
+    for (int a = 0; a < D; ++a)
+      for (int b = 0; b < D; ++b) {
+        U[a][b] = both * offset[a] * offset[b];
+        if (a == b) U[a][b] += own;
+      }
+  }
+  /// Add U at an offset times a weight.
+  template <class Number, class Real>
+  ECHOSPLINE_INLINE void respond(const Number (&offset)[D], const Real* weight, Number (&u)[D]) const {
+    Number own, both, along = weight[0] * offset[0];
+    parts(offset, own, both);
+    for (int d = 1; d < D; ++d) along += weight[d] * offset[d];
+    along *= both;
+    for (int d = 0; d < D; ++d) u[d] += own * weight[d] + along * offset[d];
   }
   /// Rigid motions at a point: shifts, then rotations.
   static void motion(const Vec<D>& x, double (&R)[D][motions]) {
@@ -97,6 +106,22 @@ struct Elastic {
   }
 
  private:
+  /// What stands before the unit matrix and before x x' in U at an offset x.
+  template <class Number>
+  ECHOSPLINE_INLINE void parts(const Number (&offset)[D], Number& own, Number& both) const {
+    typedef std::remove_cvref_t<decltype(scalar(offset[0]))> Real;
+    const Real c = static_cast<Real>(coupling), e2 = static_cast<Real>(radius2);
+    Number r2 = offset[0] * offset[0];
+    for (int d = 1; d < D; ++d) r2 += offset[d] * offset[d];
+    const Number s = r2 + e2;
+    if constexpr (D == 2) {
+      const Number per = Real(1) / s;
+      own = (Real(2) * c - Real(4)) * (logarithm(s) + Real(1)) - Real(4) * r2 * per, both = Real(4) * c * per;
+    } else {
+      const Number p = inverse_root(s), p3 = p * p * p;  // 1 / r_e, 1 / r_e^3
+      own = p3 * ((Real(4) - c) * s + Real(2) * e2), both = c * p3;
+    }
+  }
   static float scalar(Floats);
   static double scalar(Doubles);
   static double scalar(double);
@@ -105,14 +130,15 @@ struct Elastic {
 /// A kernel as the algebra of landmarks sees it, which is the same for all: numbers and functions in double precision.
 template <int D>
 struct KernelOf {
-  int components;      ///< c
-  int motions;         ///< polynomials
-  int length_power;    ///< of the kernel's values
-  double per_spring;   ///< what a spring of stiffness k adds, times k
+  int components;            ///< c
+  int motions;               ///< polynomials
+  int length_power;          ///< of the kernel's values
+  double per_spring;         ///< what a spring of stiffness k adds, times k
   double coupling, radius2;  ///< as `from` takes them
   void (*at)(const KernelOf& own, const Vec<D>& offset, double (&U)[D][D]);
   /// At the offsets from `count` places to x: (c, c) rows of `count` numbers, `stride` from a component of x to the next.
-  void (*along)(const KernelOf& own, const Vec<D>& x, const double* const (&place)[D], int64_t count, double* out, int64_t stride);
+  void (*along)(const KernelOf& own, const Vec<D>& x, const double* const (&place)[D], int64_t count, double* out,
+                int64_t stride);
   void (*motion)(const Vec<D>& x, double* out, int64_t stride);  ///< (c, motions)
 };
 
@@ -125,7 +151,8 @@ struct KernelFunctions {
     for (int a = 0; a < c; ++a)
       for (int e = 0; e < c; ++e) U[a][e] = small[a][e];
   }
-  static void along(const KernelOf<D>& own, const Vec<D>& x, const double* const (&place)[D], int64_t count, double* out, int64_t stride) {
+  static void along(const KernelOf<D>& own, const Vec<D>& x, const double* const (&place)[D], int64_t count,
+                    double* out, int64_t stride) {
     const Kernel kernel = Kernel::from(own.coupling, own.radius2);
     for (int64_t i = 0; i < count; i += DOUBLE_LANES) {
       Doubles offset[D], U[c][c];
@@ -133,7 +160,8 @@ struct KernelFunctions {
       kernel.at(offset, U);
       for (int a = 0; a < c; ++a)
         for (int e = 0; e < c; ++e)
-          for (int64_t l = 0; l < smaller<int64_t>(DOUBLE_LANES, count - i); ++l) out[a * stride + e * count + i + l] = U[a][e][l];
+          for (int64_t l = 0; l < smaller<int64_t>(DOUBLE_LANES, count - i); ++l)
+            out[a * stride + e * count + i + l] = U[a][e][l];
     }
   }
   static void motion(const Vec<D>& x, double* out, int64_t stride) {
@@ -148,8 +176,8 @@ struct KernelFunctions {
 template <int D, class Kernel>
 KernelOf<D> kernel_of(double coupling, double radius2) {
   typedef KernelFunctions<D, Kernel> Functions;
-  return {Kernel::components, Kernel::motions, Kernel::length_power, Kernel::per_spring, coupling,
-          radius2,            Functions::at,   Functions::along,     Functions::motion};
+  return {Kernel::components, Kernel::motions,  Kernel::length_power, Kernel::per_spring, coupling, radius2,
+          Functions::at,      Functions::along, Functions::motion};
 }
 
 }  // namespace echospline::ECHOSPLINE_CORE

@@ -5,6 +5,9 @@
 #include <cstdint>
 #include <cstring>
 #include <type_traits>
+#if defined(__AVX512F__)
+#include <immintrin.h>
+#endif
 
 #include "level_begin.hpp"
 
@@ -85,7 +88,9 @@ ECHOSPLINE_INLINE Vector<Real> all(Real x) {
   return Vector<Real>{} + x;
 }
 
-ECHOSPLINE_INLINE Floats pick(Ints where, Floats a, Floats b) { return (Floats)((where & (Ints)a) | (~where & (Ints)b)); }
+ECHOSPLINE_INLINE Floats pick(Ints where, Floats a, Floats b) {
+  return (Floats)((where & (Ints)a) | (~where & (Ints)b));
+}
 ECHOSPLINE_INLINE Doubles pick(Longs where, Doubles a, Doubles b) {
   return (Doubles)((where & (Longs)a) | (~where & (Longs)b));
 }
@@ -111,6 +116,19 @@ ECHOSPLINE_INLINE Doubles root(Doubles a) {
   return r;
 }
 #endif
+
+/// 1 / sqrt of positive numbers, to 1e-7 relative: a guess and its correction, which are faster than root and quotient.
+ECHOSPLINE_INLINE Floats inverse_root(Floats a) {
+#if defined(__AVX512F__)
+  const Floats y = (Floats)_mm512_maskz_rsqrt14_ps(0xffff, (__m512)a);  // masked: see gathering.hpp
+#else
+  Floats y = (Floats)(0x5f3759df - ((Ints)a >> 1));  // from the exponent, to 3 %
+  const Floats e = 1.0f - a * y * y;
+  y += y * e * (0.5f + 0.375f * e);  // to 1e-4
+#endif
+  return y + y * (0.5f - 0.5f * (a * y) * y);
+}
+ECHOSPLINE_INLINE Doubles inverse_root(Doubles a) { return 1.0 / root(a); }
 
 ECHOSPLINE_INLINE Floats to_floats(Ints a) { return __builtin_convertvector(a, Floats); }
 /// Whole numbers, towards zero.
@@ -143,12 +161,21 @@ ECHOSPLINE_INLINE Doubles logarithm(Doubles x) {
   return e * 0.693147180559945309417 + (s * 2.0 + s * z * p);
 }
 
-/// Sum over the lanes, in a fixed order.
-ECHOSPLINE_INLINE double total(Doubles v) {
-  double s = 0;
-  for (int i = 0; i < DOUBLE_LANES; ++i) s += v[i];
-  return s;
+typedef double Doubles2 __attribute__((vector_size(16)));
+typedef double Doubles4 __attribute__((vector_size(32)));
+typedef double Doubles8 __attribute__((vector_size(64)));
+/// Sum of the two halves of a vector.
+template <class Half, class Whole>
+ECHOSPLINE_INLINE Half fold(const Whole& v) {
+  Half a, b;
+  std::memcpy(&a, &v, sizeof a);
+  std::memcpy(&b, reinterpret_cast<const char*>(&v) + sizeof a, sizeof b);
+  return a + b;
 }
+/// Sum over the lanes, in an order that depends on the level's width alone.
+ECHOSPLINE_INLINE double total(const Doubles2& v) { return v[0] + v[1]; }
+ECHOSPLINE_INLINE double total(const Doubles4& v) { return total(fold<Doubles2>(v)); }
+ECHOSPLINE_INLINE double total(const Doubles8& v) { return total(fold<Doubles4>(v)); }
 template <class Real>
 ECHOSPLINE_INLINE Real largest(Vector<Real> v) {
   Real s = v[0];

@@ -10,9 +10,12 @@
 
 namespace echospline::ECHOSPLINE_CORE {
 
-constexpr double ZERO_LENGTH = 1e-9;  // mm; a needle shorter than this has no direction, touches nothing and pushes nothing
-constexpr double LET_GO = 1e-4;       // mm; a landmark that has left the needle is dropped once this close to the field without it
-constexpr double CALM = 2.5;  // no node moves further in a step than this times the needle's travel and the relaxation due
+constexpr double ZERO_LENGTH =
+    1e-9;  // mm; a needle shorter than this has no direction, touches nothing and pushes nothing
+constexpr double LET_GO =
+    1e-4;  // mm; a landmark that has left the needle is dropped once this close to the field without it
+constexpr double CALM =
+    2.5;  // no node moves further in a step than this times the needle's travel and the relaxation due
 constexpr double ARRIVED = 1e-4;  // mm; a needle this near to where it is commanded is put exactly there
 
 /// Parameters of the interaction, in the paper's names.
@@ -103,9 +106,9 @@ inline void follow(const echospline_pose& now, const echospline_command& command
   const Vec<D> new_tip = approach(tip, point_of<D>(command.tip), share, command.fastest * dt);
   const Vec<D> shaft = new_tip - new_entry, before = tip - entry;
   const double depth = norm(shaft), depth_before = norm(before);
-  const Vec<D> axis = depth > ZERO_LENGTH              ? (1 / depth) * shaft
+  const Vec<D> axis = depth > ZERO_LENGTH           ? (1 / depth) * shaft
                       : depth_before >= ZERO_LENGTH ? (1 / depth_before) * before
-                                                       : 0.0 * shaft;
+                                                    : 0.0 * shaft;
   next.speed = dot(shaft - before, axis) / dt;
   for (int d = 0; d < D; ++d) next.entry[d] = new_entry[d], next.tip[d] = new_tip[d];
 }

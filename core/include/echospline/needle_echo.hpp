@@ -23,7 +23,7 @@ constexpr int MOST_TAPS = 480;        // half width of the smoothing, entries
 constexpr int PROFILE_COUNT = 8192;   // most entries of P
 constexpr int KNOTS = 33;             // places on the needle at which angles are evaluated
 constexpr int TAIL_COUNT = 256;       // entries along the ring-down
-constexpr float ECHO_REACH = 4.2f;         // sigmas at which exp(-q) is 77 dB down: weaker echoes are not drawn
+constexpr float ECHO_REACH = 4.2f;    // sigmas at which exp(-q) is 77 dB down: weaker echoes are not drawn
 constexpr float TAIL_END = -55.0f;    // dB at which the ring-down ends, below the tissue: each millimetre costs time
 constexpr float COMB = 0.34f;         // mm between rungs of the tail: 0.27 diameters, 18 gauge with its stylet
 constexpr float BEVEL_LENGTH = 1.8f;  // diameters
@@ -265,7 +265,8 @@ class NeedleEcho {
     const Floats per = 1.0f / uqu, s = (ql_ * rl * v.ul + qa_ * ra * v.ua + qe * rz * uz_) * per;
     const Floats la = rl * v.ua - ra * v.ul, lz = rl * uz_ - rz * v.ul, az = ra * uz_ - rz * v.ua;
     const Floats q = (ql_ * qa_ * la * la + qe * (ql_ * lz * lz + qa_ * az * az)) * per;  // rQr - (rQu)^2 / uQu
-    if ((parts_ & ECHOSPLINE_SHAFT) && any(q < ECHO_REACH * ECHO_REACH)) power += exp_minus(q) * along(tables_.profile.data(), s);
+    if ((parts_ & ECHOSPLINE_SHAFT) && any(q < ECHO_REACH * ECHO_REACH))
+      power += exp_minus(q) * along(tables_.profile.data(), s);
     if (rings_) {
       // the line shifted down the beam by the t that brings it nearest to the pixel
       const Floats a = qa_ * (along_l + along_z) * per, b = qa_ * (ra - s * v.ua);
@@ -410,8 +411,8 @@ class NeedleEcho {
     const double flat = __builtin_sqrt(u_[0] * u_[0] + u_[1] * u_[1]);
     double finest = 1e9;
     for (int k = 0; k < KNOTS; ++k) finest = smaller(finest, double(knots[k].sigma));
-    footprint_.radius =
-        ECHO_REACH * smaller(widest, n.lateral * n.axial / (finest * larger(flat, 1e-6))) + (curved_ ? 0.2 * radius_ : 0.0);
+    footprint_.radius = ECHO_REACH * smaller(widest, n.lateral * n.axial / (finest * larger(flat, 1e-6))) +
+                        (curved_ ? 0.2 * radius_ : 0.0);
     for (int side = 0; side < 2; ++side) {
       const double s = side ? last : first;
       double x = entry_[0] + s * u_[0], y = entry_[1] + s * u_[1], wall[2];

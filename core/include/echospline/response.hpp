@@ -49,7 +49,8 @@ struct Column {
 
   bool reserve(int components, int64_t length, int64_t contacts) {
     ld = length, ldk = contacts;
-    return felt.reserve(components * ld) && held.reserve(components * ld) && g.reserve(components * ldk) && Pg.reserve(components * ldk);
+    return felt.reserve(components * ld) && held.reserve(components * ld) && g.reserve(components * ldk) &&
+           Pg.reserve(components * ldk);
   }
 };
 
@@ -99,6 +100,7 @@ class Response {
   Array<int32_t> source_of;  ///< (room)
   Array<int32_t> slot_of;    ///< of every source, or -1
   Array<Vec<D>> place;       ///< conditioned, (room)
+  Array<double> across[D];   ///< the same, a row per coordinate
   Array<double> felt, held;  ///< of the contacts, (room c, ld)
   Array<double> gram, P;     ///< (room c, ldk)
   Array<int32_t> parent;     ///< slot whose column a contact's is relative to; negative: an anchor's; (room)
@@ -120,15 +122,19 @@ class Response {
     Array<int32_t> new_source, new_parent, new_by_age;
     Array<Vec<D>> new_place;
     Array<double> new_felt, new_held, new_gram, new_P;
-    if (!new_source.reserve(contacts) || !new_parent.reserve(contacts) || !new_by_age.reserve(contacts) || !new_place.reserve(contacts) ||
-        !new_felt.reserve(contacts * c * ld) || !new_held.reserve(contacts * c * ld) || !new_gram.reserve(contacts * c * wide) ||
-        !new_P.reserve(contacts * c * wide) || !border_.reserve(c, ld, wide) || !carried_.reserve(c, wide) ||
-        !field_->reserve(contacts, count))
+    if (!new_source.reserve(contacts) || !new_parent.reserve(contacts) || !new_by_age.reserve(contacts) ||
+        !new_place.reserve(contacts) || !new_felt.reserve(contacts * c * ld) || !new_held.reserve(contacts * c * ld) ||
+        !new_gram.reserve(contacts * c * wide) || !new_P.reserve(contacts * c * wide) ||
+        !border_.reserve(c, ld, wide) || !carried_.reserve(c, wide) || !field_->reserve(contacts, count))
       return false;
     copy_rows(new_source, source_of, count, 1, 1, 1), copy_rows(new_parent, parent, count, 1, 1, 1);
     copy_rows(new_by_age, by_age, count, 1, 1, 1), copy_rows(new_place, place, count, 1, 1, 1);
     copy_rows(new_felt, felt, count * c, ld, ld, ld), copy_rows(new_held, held, count * c, ld, ld, ld);
     copy_rows(new_gram, gram, count * c, wide, ldk, count * c), copy_rows(new_P, P, count * c, wide, ldk, count * c);
+    for (int d = 0; d < D; ++d) {
+      if (!across[d].reserve(rounded_up(contacts, ROW))) return false;
+      for (int64_t i = 0; i < count; ++i) across[d][i] = place[i][d];
+    }
     source_of.swap(new_source), parent.swap(new_parent), by_age.swap(new_by_age), place.swap(new_place);
     felt.swap(new_felt), held.swap(new_held), gram.swap(new_gram), P.swap(new_P);
     room = contacts, ldk = wide;
@@ -141,12 +147,15 @@ class Response {
     anchored_->felt(p, tip.felt.data());
     anchored_->held(tip.felt.data(), tip.held.data());
     const int64_t n = width(), ld = anchored_->ld;
-    double G[D][D];
-    for (int64_t j = 0; j < count; ++j) {
-      anchored_->green(place[j], felt.data() + j * c * ld, p, tip.held.data(), G);
-      for (int a = 0; a < c; ++a)
-        for (int e = 0; e < c; ++e) tip.g[a * ldk + j * c + e] = G[e][a];
-    }
+    const double* places[D];
+    for (int d = 0; d < D; ++d) places[d] = across[d].data();
+    double* U = tip.Pg.data();  // until P g is known
+    anchored_->kernel.along(anchored_->kernel, p, places, count, U, ldk);
+    for (int a = 0; a < c; ++a)
+      for (int64_t j = 0; j < count; ++j)
+        for (int e = 0; e < c; ++e)
+          tip.g[a * ldk + j * c + e] =
+              U[a * ldk + e * count + j] - dot(felt.data() + (j * c + e) * ld, tip.held.data() + a * ld, ld);
     for (int a = 0; a < c; ++a) {
       for (int64_t i = count * c; i < n; ++i) tip.g[a * ldk + i] = tip.Pg[a * ldk + i] = 0;
       for (int64_t i = 0; i < count * c; ++i) tip.Pg[a * ldk + i] = dot(P.data() + i * ldk, tip.g.data() + a * ldk, n);
@@ -207,7 +216,7 @@ class Response {
     double S[D][D], V[D][D], own[D][D];
     add_softness(border_.own, softness, S);
     if (!invert_small<D>(c, S, V)) return false;
-    source_of[k] = source, slot_of[source] = static_cast<int32_t>(k), place[k] = p;
+    source_of[k] = source, slot_of[source] = static_cast<int32_t>(k), set_place(k, p);
     std::memcpy(&felt[kc * ld], border_.felt.data(), static_cast<size_t>(c * ld) * sizeof(double));
     std::memcpy(&held[kc * ld], border_.held.data(), static_cast<size_t>(c * ld) * sizeof(double));
     anchored_->green(p, border_.felt.data(), p, border_.held.data(), own);
@@ -255,7 +264,8 @@ class Response {
     move_last(P, slot, last), move_last(gram, slot, last);
     slot_of[source_of[slot]] = -1;
     if (slot != last) {
-      source_of[slot] = source_of[last], slot_of[source_of[slot]] = static_cast<int32_t>(slot), place[slot] = place[last];
+      source_of[slot] = source_of[last], slot_of[source_of[slot]] = static_cast<int32_t>(slot);
+      set_place(slot, place[last]);
       std::memcpy(&felt[slot * c * ld], &felt[last * c * ld], static_cast<size_t>(c * ld) * sizeof(double));
       std::memcpy(&held[slot * c * ld], &held[last * c * ld], static_cast<size_t>(c * ld) * sizeof(double));
       field_->move(last, slot);
@@ -286,7 +296,8 @@ class Response {
     if (tip) {
       std::memcpy(border_.held.data(), tip->held.data(), static_cast<size_t>(c * anchored_->ld) * sizeof(double));
       subtract_held(base, border_.held.data());
-      given.tip = true, given.place = tip->place, given.base = base.place, given.s = s, given.held = border_.held.data();
+      given.tip = true, given.place = tip->place, given.base = base.place, given.s = s,
+      given.held = border_.held.data();
     }
     if (field_->needs_landmarks()) gather(w, tip, s, given.landmarks);
     return field_->compute(given);
@@ -302,7 +313,8 @@ class Response {
     for (int64_t j = 0; j < count; ++j)
       for (int d = 0; d < D; ++d) out.place[(b + j) * D + d] = place[j][d], out.weight[(b + j) * D + d] = w.at(j, d);
     if (tip)
-      for (int d = 0; d < D; ++d) out.place[(b + count) * D + d] = tip->place[d], out.weight[(b + count) * D + d] = s[d];
+      for (int d = 0; d < D; ++d)
+        out.place[(b + count) * D + d] = tip->place[d], out.weight[(b + count) * D + d] = s[d];
     // anchors and motions: -(held w + held_tip s)
     for (int r = 0; r < w.count; ++r)
       for (int64_t i = 0; i < m; ++i) {
@@ -329,9 +341,14 @@ class Response {
   Sides<D> carried_;  ///< weights of contacts and all their descendants
 
   int64_t width() const { return rounded_up(count * c, ROW); }
+  void set_place(int64_t slot, const Vec<D>& p) {
+    place[slot] = p;
+    for (int d = 0; d < D; ++d) across[d][slot] = p[d];
+  }
 
   template <class T>
-  static void copy_rows(Array<T>& to, const Array<T>& from, int64_t rows, int64_t to_ld, int64_t from_ld, int64_t numbers) {
+  static void copy_rows(Array<T>& to, const Array<T>& from, int64_t rows, int64_t to_ld, int64_t from_ld,
+                        int64_t numbers) {
     for (int64_t i = 0; i < rows; ++i)
       for (int64_t l = 0; l < numbers; ++l) to[i * to_ld + l] = from[i * from_ld + l];
   }
@@ -381,7 +398,8 @@ class Response {
   }
   /// Weights of the kept columns: those of contacts, with what each carries for its descendants and for a tip that is relative to it.
   void carry(const Sides<D>& w, int64_t base, const Vec<D>& s) {
-    for (int r = 0; r < w.count; ++r) std::memcpy(carried_.side(r), w.side(r), static_cast<size_t>(count * c) * sizeof(double));
+    for (int r = 0; r < w.count; ++r)
+      std::memcpy(carried_.side(r), w.side(r), static_cast<size_t>(count * c) * sizeof(double));
     for (int d = 0; base >= 0 && d < D; ++d) carried_.at(base, d) += s[d];
     for (int64_t i = count; i-- > 0;) {
       const int64_t child = by_age[i], to = parent[child];
@@ -419,7 +437,8 @@ class Response {
   /// P from the matrix itself, by Gauss and Jordan without pivots: the matrix is positive definite.
   bool rebuild() {
     const int64_t kc = count * c, n = width();
-    for (int64_t i = 0; i < kc; ++i) std::memcpy(&P[i * ldk], &gram[i * ldk], static_cast<size_t>(ldk) * sizeof(double));
+    for (int64_t i = 0; i < kc; ++i)
+      std::memcpy(&P[i * ldk], &gram[i * ldk], static_cast<size_t>(ldk) * sizeof(double));
     for (int64_t j = 0; j < kc; ++j) {
       double* row = P.data() + j * ldk;
       const double pivot = row[j];

@@ -15,8 +15,9 @@ struct Largest {
 template <int D>
 struct LandmarkWeights {
   int64_t count = 0;
-  double* place = nullptr;   ///< conditioned, (count, D)
-  double* weight = nullptr;  ///< (count, D), then (motions, D) of the affine motions or (motions) rows of which the first number counts
+  double* place = nullptr;  ///< conditioned, (count, D)
+  double* weight =
+      nullptr;  ///< (count, D), then (motions, D) of the affine motions or (motions) rows of which the first number counts
 };
 
 /// What a field is computed from.
@@ -26,10 +27,10 @@ struct Weights {
   const double* carried = nullptr;  ///< weights of their kept columns, as `Sides`
   int64_t ld = 0;                   ///< of `carried`
   bool tip = false;                 ///< whether there is a tip with a column of its own
-  Vec<D> place{}, base{}, s{};      ///< of the tip and the landmark that its column is relative to, conditioned; its weight
-  const double* held = nullptr;     ///< L_B^-1 [U P]' of the tip less that of its base
-  bool at_rest = false;             ///< into the field at rest instead of the next one
-  LandmarkWeights<D> landmarks;     ///< where the field needs them
+  Vec<D> place{}, base{}, s{};  ///< of the tip and the landmark that its column is relative to, conditioned; its weight
+  const double* held = nullptr;  ///< L_B^-1 [U P]' of the tip less that of its base
+  bool at_rest = false;          ///< into the field at rest instead of the next one
+  LandmarkWeights<D> landmarks;  ///< where the field needs them
 };
 
 /// The field of one session. Functions that a class behind this one does not replace are never called.

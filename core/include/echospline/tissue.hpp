@@ -56,8 +56,8 @@ class Tissue {
   bool build() {
     const int64_t K = scene.sources();
     field_ = scene.field->create_session();
-    return field_ && response_.build(&scene.anchored, field_, K) && touched_.reserve(K) && alongs_.reserve(K) && wanted_.reserve(K) &&
-           reserve(smaller(larger<int64_t>(scene.contact_room, 1), larger<int64_t>(K, 1)));
+    return field_ && response_.build(&scene.anchored, field_, K) && touched_.reserve(K) && alongs_.reserve(K) &&
+           wanted_.reserve(K) && reserve(smaller(larger<int64_t>(scene.contact_room, 1), larger<int64_t>(K, 1)));
   }
   double residual() const { return response_.residual; }
   int64_t rebuilt() const { return response_.rebuilt; }
@@ -163,9 +163,9 @@ class Tissue {
   /// What one step decides.
   struct Step {
     TipLandmark<D> tip;
-    double softness = 0;         ///< of the tip's landmark
-    int64_t on_tip = -1;         ///< the contact that the tip replaces, or -1
-    Vec<D> s{};                  ///< the tip's weight
+    double softness = 0;  ///< of the tip's landmark
+    int64_t on_tip = -1;  ///< the contact that the tip replaces, or -1
+    Vec<D> s{};           ///< the tip's weight
     bool has_column() const { return tip.present && on_tip < 0; }
   };
 
@@ -188,8 +188,9 @@ class Tissue {
     for (int64_t i = 0; i < state.count; ++i) kept[i] = state.contacts[i];
     for (int64_t i = 0; i < next_count_; ++i) kept_next[i] = next_[i];
     if (!new_q_.reserve(contacts) || !free_.reserve(contacts) || !tip_column_.reserve(c, ld, wide) ||
-        !other_column_.reserve(c, ld, wide) || !q_.reserve(c, wide) || !w_.reserve(c, wide) || !leaving_.reserve(contacts) ||
-        !small_.reserve(contacts * c * wide) || !small_sides_.reserve(D * wide) || !response_.reserve(contacts))
+        !other_column_.reserve(c, ld, wide) || !q_.reserve(c, wide) || !w_.reserve(c, wide) ||
+        !leaving_.reserve(contacts) || !small_.reserve(contacts * c * wide) || !small_sides_.reserve(D * wide) ||
+        !response_.reserve(contacts))
       return false;
     state.contacts.swap(kept), next_.swap(kept_next);
     return true;
@@ -244,8 +245,8 @@ class Tissue {
       row.source = static_cast<int32_t>(source), row.touching = touching;
       row.q = old ? old->q : field_->now(source);
       row.along = held ? old->along : smaller(larger(along, 0.0), n.depth);
-      row.grip = old && (held || !touching) ? old->grip
-                                            : p.drag * (across(row.q, n.axis) - (n.entry + row.along * n.axis));
+      row.grip =
+          old && (held || !touching) ? old->grip : p.drag * (across(row.q, n.axis) - (n.entry + row.along * n.axis));
     }
     next_count_ = rows;
     return done;
@@ -261,7 +262,8 @@ class Tissue {
     const ContactLattice<D>& lattice = scene.lattice;
     int32_t low[D], high[D];
     for (int d = 0; d < D; ++d)
-      if (!lattice_range(d, smaller(n.entry[d], n.tip[d]) - far, larger(n.entry[d], n.tip[d]) + far, low[d], high[d])) return 0;
+      if (!lattice_range(d, smaller(n.entry[d], n.tip[d]) - far, larger(n.entry[d], n.tip[d]) + far, low[d], high[d]))
+        return 0;
     int64_t count = 0;
     int32_t line[D];
     for (int d = 0; d < D; ++d) line[d] = low[d];
@@ -285,7 +287,8 @@ class Tissue {
   }
   bool lattice_range(int d, double from, double to, int32_t& first, int32_t& last) const {
     const ContactLattice<D>& lattice = scene.lattice;
-    const double h = scene.grid.spacing[d] * lattice.stride[d], x0 = scene.grid.origin[d] + scene.grid.spacing[d] * lattice.first[d];
+    const double h = scene.grid.spacing[d] * lattice.stride[d],
+                 x0 = scene.grid.origin[d] + scene.grid.spacing[d] * lattice.first[d];
     const double a = std::ceil((from - x0) / h - 1e-9), b = std::floor((to - x0) / h + 1e-9);
     if (!(a <= lattice.lines[d] - 1 && b >= 0)) return false;
     first = static_cast<int32_t>(larger(a, 0.0)), last = static_cast<int32_t>(smaller(b, lattice.lines[d] - 1.0));
@@ -295,7 +298,8 @@ class Tissue {
   bool line_range(const Needle<D>& n, const int32_t (&line)[D], double far, int32_t& first, int32_t& last) const {
     double lo = 0, hi = n.depth;
     for (int d = 1; d < D; ++d) {
-      const double y = scene.grid.origin[d] + scene.grid.spacing[d] * (scene.lattice.first[d] + scene.lattice.stride[d] * line[d]);
+      const double y =
+          scene.grid.origin[d] + scene.grid.spacing[d] * (scene.lattice.first[d] + scene.lattice.stride[d] * line[d]);
       if (std::fabs(n.axis[d]) > PARALLEL) {
         const double a = (y - far - n.entry[d]) / n.axis[d], b = (y + far - n.entry[d]) / n.axis[d];
         lo = larger(lo, smaller(a, b)), hi = smaller(hi, larger(a, b));
@@ -343,7 +347,8 @@ class Tissue {
   /// Right-hand sides `q_` for the contacts of `next_`; the tip's displacement for one that it replaces.
   template <class Displacement>
   void fill(int64_t count, const Step& step, Displacement q) {
-    for (int64_t j = 0; j < count; ++j) q_.set(response_.slot_of[next_[j].source], j == step.on_tip ? step.tip.q : q(j));
+    for (int64_t j = 0; j < count; ++j)
+      q_.set(response_.slot_of[next_[j].source], j == step.on_tip ? step.tip.q : q(j));
     q_.clear_beyond(count);
   }
   int64_t contact_at(const Array<Contact<D>>& contacts, int64_t count, const TipLandmark<D>& tip) const {
@@ -396,7 +401,8 @@ class Tissue {
       tip.q = n.tip + push * n.axis - place;
       return;
     }
-    Vec<D> was = before.q;  // a tip that begins to push starts from the displacement that the tissue had there before the step
+    Vec<D> was =
+        before.q;  // a tip that begins to push starts from the displacement that the tissue had there before the step
     if (!before.present) {
       fill(next_count_, step, [&](int64_t j) { return next_[j].q; });
       was = response_.at(tip_column_, q_);
@@ -492,7 +498,8 @@ class Tissue {
   /// Weights (`w_`) of contacts that are set, and of a tip.
   Weighted solve(const Array<Contact<D>>& contacts, int64_t count, const TipLandmark<D>& tip) {
     const int64_t on_tip = contact_at(contacts, count, tip);
-    for (int64_t j = 0; j < count; ++j) q_.set(response_.slot_of[contacts[j].source], j == on_tip ? tip.q : contacts[j].q);
+    for (int64_t j = 0; j < count; ++j)
+      q_.set(response_.slot_of[contacts[j].source], j == on_tip ? tip.q : contacts[j].q);
     q_.clear_beyond(count);
     Weighted weighted{tip.present && on_tip < 0 ? &tip_column_ : nullptr, {}};
     if (weighted.column) {

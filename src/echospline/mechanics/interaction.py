@@ -6,17 +6,48 @@ displacement loads, what withdrawal and tilting do) is read as `docs/theory.md` 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import exp, inf
+from typing import Protocol
 
 import numpy as np
 
-from echospline.scene import Floats, NeedlePose
+from echospline.scene import Floats
 
 LET_GO = 1e-4
 """mm; a landmark that has left the needle is dropped once it is this close to the field without it."""
 
 CALM = 2.5
 """A step moves no node further than this times the needle's travel and the relaxation due (``loading="follow"``)."""
+
+
+class Pose(Protocol):
+    """Position of the needle at one instant, in the plane (`NeedlePose`) or in space: D numbers per point."""
+
+    @property
+    def entry(self) -> Sequence[float]:
+        """n_s, the point of entry, mm."""
+        ...
+
+    @property
+    def tip(self) -> Sequence[float]:
+        """n_t, the tip, mm."""
+        ...
+
+    @property
+    def speed(self) -> float:
+        """Signed speed of the tip along the axis, mm/s."""
+        ...
+
+    @property
+    def depth(self) -> float:
+        """Length of the shaft from entry to tip, mm."""
+        ...
+
+    @property
+    def axis(self) -> Sequence[float]:
+        """Unit vector from entry to tip; zero for a needle of zero length."""
+        ...
 
 
 def friction(distance: Floats, speed: float, alpha1: float, alpha2: float, length: float) -> Floats:
@@ -59,10 +90,9 @@ def relax(q: Floats, target: Floats, alpha3: float, dt: float) -> Floats:
 
 
 def approach(q: Floats, target: Floats, travel: float) -> Floats:
-    """Move displacements (k, 2) towards their targets, none further than ``travel`` (mm)."""
+    """Move displacements (k, D) towards their targets, none further than ``travel`` (mm)."""
     gap = target - q
-    distance = np.hypot(gap[:, 0], gap[:, 1])
-    share = np.minimum(1.0, travel / np.maximum(distance, 1e-300))
+    share = np.minimum(1.0, travel / np.maximum(np.linalg.norm(gap, axis=1), 1e-300))
     moved: Floats = q + gap * share[:, None]
     return moved
 
@@ -76,13 +106,13 @@ def load(q: Floats, f: Floats, side: Floats, axis: Floats, alpha3: float, dt: fl
 
     Parameters
     ----------
-    q : ndarray, shape (k, 2)
+    q : ndarray, shape (k, D)
         Displacements so far, mm.
     f : ndarray, shape (k,)
         Friction displacement along the axis, equation (15), mm.
-    side : ndarray, shape (k, 2)
+    side : ndarray, shape (k, D)
         Displacement across the axis that the shaft asks for, mm.
-    axis : ndarray, shape (2,)
+    axis : ndarray, shape (D,)
         Unit vector from entry to tip.
     alpha3, dt : float
         Rate (1/s) and time (s) of relaxation.
@@ -92,7 +122,7 @@ def load(q: Floats, f: Floats, side: Floats, axis: Floats, alpha3: float, dt: fl
 
     Returns
     -------
-    ndarray, shape (k, 2)
+    ndarray, shape (k, D)
         mm.
     """
     along = q @ axis
@@ -103,7 +133,7 @@ def load(q: Floats, f: Floats, side: Floats, axis: Floats, alpha3: float, dt: fl
     return approach(rested, target, travel)
 
 
-def tip_push(pose: NeedlePose, sigma: float, clearance: float) -> float:
+def tip_push(pose: Pose, sigma: float, clearance: float) -> float:
     """How far the tip pushes the tissue ahead of it: sigma of equation (12), mm.
 
     While the tip is shallower than sigma the push is the depth itself; towards a clamped edge, which cannot be
@@ -111,7 +141,7 @@ def tip_push(pose: NeedlePose, sigma: float, clearance: float) -> float:
 
     Parameters
     ----------
-    pose : NeedlePose
+    pose : Pose
         Where the needle is.
     sigma : float
         mm.
@@ -123,12 +153,10 @@ def tip_push(pose: NeedlePose, sigma: float, clearance: float) -> float:
     return push * near * near * (3.0 - 2.0 * near)
 
 
-def needle_travel(before: NeedlePose, after: NeedlePose) -> float:
+def needle_travel(before: Pose, after: Pose) -> float:
     """Longest way that a point of the shaft has moved between two poses, mm (a straight needle: at one of its ends)."""
-    ends = [
-        np.hypot(b[0] - a[0], b[1] - a[1]) for a, b in ((before.entry, after.entry), (before.tip, after.tip))
-    ]
-    return float(max(ends))
+    ends = ((before.entry, after.entry), (before.tip, after.tip))
+    return float(max(np.linalg.norm(np.subtract(b, a)) for a, b in ends))
 
 
 def largest_share(start: Floats, end: Floats, limit: float) -> float:

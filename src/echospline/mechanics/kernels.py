@@ -1,12 +1,12 @@
-"""Kernels of landmark splines: what one landmark does to a point elsewhere.
+"""Kernels of landmark splines: what one landmark does to a point elsewhere, in the plane and in space.
 
-Two are here. `ThinPlate` is the paper's, equation (3): one scalar serves both components of the displacement.
-`Elastic` is the regularised fundamental solution of plane elasticity: a 2 x 2 matrix couples them.
+Two are here. `ThinPlate` is the paper's, equation (3): one scalar serves all components of the displacement.
+`Elastic` is the regularised fundamental solution of elasticity: a matrix couples the components.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
 import numpy as np
@@ -14,16 +14,27 @@ import numpy as np
 from echospline.errors import InputError
 from echospline.scene import Floats
 
+Dimension = Literal[2, 3]
+
+TURNS = {2: ((0, 1),), 3: ((0, 1), (1, 2), (2, 0))}
+"""Axes (a, b) of the plane in which each rigid rotation turns a towards b."""
+
 
 class Kernel(Protocol):
     """What a spline needs to know of its kernel.
 
-    Matrices are laid out in blocks: with two components, all x rows (columns) stand before all y rows.
+    Matrices are laid out in blocks: with c components, all x rows (columns) stand before all y rows (and those before z).
+    D is the dimension.
     """
 
     @property
+    def dimension(self) -> Dimension:
+        """D: 2 in the plane, 3 in space."""
+        ...
+
+    @property
     def components(self) -> int:
-        """c: 1 where one scalar serves x and y alike, 2 where a 2 x 2 matrix couples them."""
+        """c: 1 where one scalar serves all components alike, D where a D x D matrix couples them."""
         ...
 
     @property
@@ -31,16 +42,21 @@ class Kernel(Protocol):
         """Power of length that the kernel's values carry (2: mm^2, 0: none)."""
         ...
 
+    @property
+    def per_spring(self) -> float:
+        """Right side of the kernel's equation, over the point load: a spring of stiffness k adds this over k to K."""
+        ...
+
     def scaled(self, length: float) -> Kernel:
         """Return the kernel for coordinates divided by ``length`` mm."""
         ...
 
     def matrix(self, points: Floats, sources: Floats) -> Floats:
-        """Response at points (n, 2) to unit weights at sources (m, 2), shape (n c, m c)."""
+        """Response at points (n, D) to unit weights at sources (m, D), shape (n c, m c)."""
         ...
 
     def gradient(self, points: Floats, sources: Floats) -> Floats:
-        """Derivatives of `matrix` by the point's x and y, shape (2, n c, m c)."""
+        """Derivatives of `matrix` by the point's coordinates, shape (D, n c, m c)."""
         ...
 
     def polynomial(self, points: Floats) -> Floats:
@@ -48,15 +64,14 @@ class Kernel(Protocol):
         ...
 
     def polynomial_gradient(self, points: Floats) -> Floats:
-        """Derivatives of `polynomial` by x and y, shape (2, n c, p)."""
+        """Derivatives of `polynomial` by the coordinates, shape (D, n c, p)."""
         ...
 
 
-def _offsets(points: Floats, sources: Floats) -> tuple[Floats, Floats, Floats]:
-    """Offsets dx, dy and squared distance r^2 from every source to every point, each (n, m)."""
-    dx = points[:, 0, None] - sources[None, :, 0]
-    dy = points[:, 1, None] - sources[None, :, 1]
-    return dx, dy, dx * dx + dy * dy
+def _offsets(points: Floats, sources: Floats) -> tuple[Floats, Floats]:
+    """Offsets (D, n, m) and squared distance r^2 (n, m) from every source to every point."""
+    offset = points.T[:, :, None] - sources.T[:, None, :]
+    return offset, (offset * offset).sum(axis=0)
 
 
 def _log(r2: Floats) -> Floats:
@@ -64,47 +79,89 @@ def _log(r2: Floats) -> Floats:
     return np.log(r2, out=np.zeros_like(r2), where=r2 > 0)
 
 
+def _check(dimension: int) -> None:
+    if dimension not in (2, 3):
+        raise InputError(f"dimension of a kernel is 2 (plane) or 3 (space); got {dimension}")
+
+
 @dataclass(frozen=True)
 class ThinPlate:
-    """U(r) = r^2 ln r^2, equation (3), with the affine motions of equation (5)."""
+    """U(r) = r^2 ln r^2, equation (3), with the affine motions of equation (5); in space -r.
 
-    components: int = 1
-    length_power: int = 2
+    The biharmonic equation has the solution r in space. Its sign is turned so that K is positive definite beside the
+    side conditions, as that of r^2 ln r^2 is; the field of a spline does not depend on it.
+
+    Parameters
+    ----------
+    dimension : {2, 3}
+        Plane or space.
+
+    Raises
+    ------
+    InputError
+        If the dimension is another.
+    """
+
+    dimension: Dimension = 2
+
+    def __post_init__(self) -> None:
+        _check(self.dimension)
+
+    @property
+    def components(self) -> int:
+        """1: a scalar serves all components."""
+        return 1
+
+    @property
+    def length_power(self) -> int:
+        """mm^2 in the plane, mm in space."""
+        return 2 if self.dimension == 2 else 1
+
+    @property
+    def per_spring(self) -> float:
+        """16 pi in the plane, 8 pi in space."""
+        return 16.0 * np.pi if self.dimension == 2 else 8.0 * np.pi
 
     def scaled(self, length: float) -> ThinPlate:
-        """Return itself: a change of unit adds r^2 times a constant, which the side conditions turn affine."""
+        """Return itself: a change of unit adds r^2 times a constant, which the side conditions turn affine, or only scales."""
         return self
 
     def matrix(self, points: Floats, sources: Floats) -> Floats:
         """U(r), shape (n, m), equation (4)."""
-        _, _, r2 = _offsets(points, sources)
-        return r2 * _log(r2)
+        _, r2 = _offsets(points, sources)
+        U: Floats = r2 * _log(r2) if self.dimension == 2 else -np.sqrt(r2)
+        return U
 
     def gradient(self, points: Floats, sources: Floats) -> Floats:
-        """dU/dx = 2 dx (ln r^2 + 1), shape (2, n, m)."""
-        dx, dy, r2 = _offsets(points, sources)
-        slope = 2.0 * (_log(r2) + 1.0)
-        return np.stack([dx * slope, dy * slope])
+        """dU/dx = 2 dx (ln r^2 + 1), in space -dx / r and 0 at the source itself, shape (D, n, m)."""
+        offset, r2 = _offsets(points, sources)
+        if self.dimension == 2:
+            return offset * (2.0 * (_log(r2) + 1.0))
+        r = np.sqrt(r2)
+        return -offset * np.divide(1.0, r, out=np.zeros_like(r), where=r > 0)
 
     def polynomial(self, points: Floats) -> Floats:
-        """Rows (1, x, y), the matrix R of equation (5), shape (n, 3)."""
+        """Rows (1, x, y[, z]), the matrix R of equation (5), shape (n, D + 1)."""
         return np.column_stack([np.ones(len(points)), points])
 
     def polynomial_gradient(self, points: Floats) -> Floats:
-        """Return the derivatives of R, shape (2, n, 3)."""
-        gradient = np.zeros((2, len(points), 3))
-        gradient[0, :, 1] = gradient[1, :, 2] = 1.0
+        """Return the derivatives of R, shape (D, n, D + 1)."""
+        D = self.dimension
+        gradient = np.zeros((D, len(points), D + 1))
+        for j in range(D):
+            gradient[j, :, j + 1] = 1.0
         return gradient
 
 
 @dataclass(frozen=True)
 class Elastic:
-    """Regularised fundamental solution of plane elasticity (Kelvin), with rigid motions.
+    """Regularised fundamental solution of elasticity (Kelvin), with rigid motions; 16 pi mu goes into the weights.
 
-    With phi = s ln s, s = r^2 + radius^2, the field of a force f is
-    -(lap(phi) I - c grad grad(phi)) f with c = 1 / (2 (1 - nu)) (Papkovich and Neuber's form; elastic body
-    splines: Davis et al. 1997; regularised Kelvinlets: de Goes and James 2017). The factor 1 / (16 pi mu)
-    goes into the weights.
+    Plane: with phi = s ln s, s = r^2 + radius^2, the field of a force f is -(lap(phi) I - c grad grad(phi)) f with
+    c = 1 / (2 (1 - nu)) (Papkovich and Neuber's form; elastic body splines: Davis et al. 1997).
+
+    Space: the regularised Kelvinlet (de Goes and James 2017), with r_e = sqrt(r^2 + radius^2) and
+    c = 1 / (1 - nu): ((4 - c) / r_e + 2 radius^2 / r_e^3) f + c x (x . f) / r_e^3.
 
     Parameters
     ----------
@@ -113,83 +170,124 @@ class Elastic:
     radius : float
         Regularisation length, mm, positive.
     plane : {"stress", "strain"}
-        Plane stress uses nu / (1 + nu) in the plane-strain solution.
+        Plane stress uses nu / (1 + nu) in the plane-strain solution. In space it has no meaning.
+    dimension : {2, 3}
+        Plane or space.
 
     Raises
     ------
     InputError
-        If nu or radius is out of its range.
+        If nu or radius is out of its range, or plane or dimension is another.
     """
 
     nu: float = 0.45
     radius: float = 1.0
     plane: Literal["stress", "strain"] = "stress"
-    components: int = 2
-    length_power: int = 0
+    dimension: Dimension = 2
 
     def __post_init__(self) -> None:
-        if not (0.0 <= self.nu <= 0.5 if self.plane == "stress" else 0.0 <= self.nu < 0.5):
-            closing = "]" if self.plane == "stress" else ")"
+        _check(self.dimension)
+        if self.plane not in ("stress", "strain"):
+            raise InputError(f'plane is "stress" or "strain"; got {self.plane!r}')
+        strain = self.dimension == 2 and self.plane == "strain"
+        if not (0.0 <= self.nu < 0.5 if strain else 0.0 <= self.nu <= 0.5):
+            where = f" in plane {self.plane}" if self.dimension == 2 else ""
             raise InputError(
-                f"nu (Poisson's ratio) must lie in [0, 0.5{closing} in plane {self.plane}; got {self.nu}"
+                f"nu (Poisson's ratio) must lie in [0, 0.5{')' if strain else ']'}{where}; got {self.nu}"
             )
         if not (np.isfinite(self.radius) and self.radius > 0):
             raise InputError(
                 f"radius of the elastic kernel must be a positive number in mm; got {self.radius}"
             )
-        if self.plane not in ("stress", "strain"):
-            raise InputError(f'plane is "stress" or "strain"; got {self.plane!r}')
+
+    @property
+    def components(self) -> int:
+        """D: a matrix couples the components."""
+        return self.dimension
+
+    @property
+    def length_power(self) -> int:
+        """None in the plane, 1 / mm in space."""
+        return 0 if self.dimension == 2 else -1
+
+    @property
+    def per_spring(self) -> float:
+        """16 pi."""
+        return 16.0 * np.pi
 
     @property
     def coupling(self) -> float:
-        """c = 1 / (2 (1 - nu)), with the effective nu of plane stress."""
+        """c = 1 / (2 (1 - nu)), with the effective nu of plane stress; in space 1 / (1 - nu)."""
+        if self.dimension == 3:
+            return 1.0 / (1.0 - self.nu)
         nu = self.nu / (1.0 + self.nu) if self.plane == "stress" else self.nu
         return 1.0 / (2.0 * (1.0 - nu))
 
     def scaled(self, length: float) -> Elastic:
-        """Return the kernel for coordinates divided by ``length``; the constant that this adds does no work."""
-        return Elastic(self.nu, self.radius / length, self.plane)
+        """Return the kernel for coordinates divided by ``length``; the constant or factor that this adds does no work."""
+        return replace(self, radius=self.radius / length)
 
     def matrix(self, points: Floats, sources: Floats) -> Floats:
-        """-(lap(phi) I - c grad grad(phi)), shape (2 n, 2 m)."""
-        dx, dy, r2 = _offsets(points, sources)
-        s = r2 + self.radius**2
-        c = self.coupling
-        isotropic = -(4.0 - 2.0 * c) * (np.log(s) + 1.0) - 4.0 * r2 / s
+        """Field of unit forces, (own I + both x x') per point and source, shape (D n, D m)."""
+        offset, r2 = _offsets(points, sources)
+        own, both = self._parts(r2)
+        D = self.dimension
         return np.block(
-            [
-                [isotropic + 4.0 * c * dx * dx / s, 4.0 * c * dx * dy / s],
-                [4.0 * c * dx * dy / s, isotropic + 4.0 * c * dy * dy / s],
-            ]
+            [[both * offset[a] * offset[b] + (own if a == b else 0.0) for b in range(D)] for a in range(D)]
         )
 
     def gradient(self, points: Floats, sources: Floats) -> Floats:
-        """Derivatives of `matrix` by x and y, shape (2, 2 n, 2 m)."""
-        dx, dy, r2 = _offsets(points, sources)
-        s = r2 + self.radius**2
-        c = self.coupling
+        """Derivatives of `matrix` by the coordinates, shape (D, D n, D m)."""
+        offset, r2 = _offsets(points, sources)
+        _, both = self._parts(r2)
+        own_slope, both_slope = self._slopes(r2)
+        D = self.dimension
 
-        def by(offset: Floats, ex: float, ey: float) -> Floats:
-            # d/dx of ln s is 2 dx / s; of r^2 / s is 2 dx radius^2 / s^2; of a b / s by the product rule
-            iso = -(4.0 - 2.0 * c) * 2.0 * offset / s - 8.0 * offset * self.radius**2 / s**2
-            xx = 4.0 * c * (2.0 * ex * dx / s - 2.0 * dx * dx * offset / s**2)
-            yy = 4.0 * c * (2.0 * ey * dy / s - 2.0 * dy * dy * offset / s**2)
-            xy = 4.0 * c * ((ex * dy + ey * dx) / s - 2.0 * dx * dy * offset / s**2)
-            return np.block([[iso + xx, xy], [xy, iso + yy]])
+        def entry(a: int, b: int, k: int) -> Floats:
+            # the product rule for both x_a x_b; d/dx_k of a function of r^2 is 2 x_k times its slope
+            by: Floats = 2.0 * both_slope * offset[k] * offset[a] * offset[b]
+            if a == b:
+                by += 2.0 * own_slope * offset[k]
+            if a == k:
+                by += both * offset[b]
+            if b == k:
+                by += both * offset[a]
+            return by
 
-        return np.stack([by(dx, 1.0, 0.0), by(dy, 0.0, 1.0)])
+        return np.stack([np.block([[entry(a, b, k) for b in range(D)] for a in range(D)]) for k in range(D)])
+
+    def _parts(self, r2: Floats) -> tuple[Floats, Floats]:
+        """Functions of r^2 that stand before I and before x x'."""
+        c, e2 = self.coupling, self.radius**2
+        s = r2 + e2
+        if self.dimension == 2:
+            return -(4.0 - 2.0 * c) * (np.log(s) + 1.0) - 4.0 * r2 / s, 4.0 * c / s
+        p = 1.0 / np.sqrt(s)
+        return (4.0 - c) * p + 2.0 * e2 * p**3, c * p**3
+
+    def _slopes(self, r2: Floats) -> tuple[Floats, Floats]:
+        """Derivatives of `_parts` by r^2."""
+        c, e2 = self.coupling, self.radius**2
+        s = r2 + e2
+        if self.dimension == 2:
+            return -(4.0 - 2.0 * c) / s - 4.0 * e2 / s**2, -4.0 * c / s**2
+        p = 1.0 / np.sqrt(s)
+        return -0.5 * (4.0 - c) * p**3 - 3.0 * e2 * p**5, -1.5 * c * p**5
 
     def polynomial(self, points: Floats) -> Floats:
-        """Rigid motions: shift in x, shift in y, rotation, shape (2 n, 3)."""
-        one, zero = np.ones(len(points)), np.zeros(len(points))
-        return np.vstack(
-            [np.column_stack([one, zero, -points[:, 1]]), np.column_stack([zero, one, points[:, 0]])]
-        )
+        """Rigid motions: shifts, then rotations, shape (D n, 3) in the plane and (D n, 6) in space."""
+        n, D = len(points), self.dimension
+        motions = np.zeros((D, n, D + len(TURNS[D])))
+        for a in range(D):
+            motions[a, :, a] = 1.0
+        for j, (a, b) in enumerate(TURNS[D], start=D):
+            motions[a, :, j], motions[b, :, j] = -points[:, b], points[:, a]
+        return motions.reshape(D * n, -1)
 
     def polynomial_gradient(self, points: Floats) -> Floats:
-        """Return the derivatives of the rigid motions, shape (2, 2 n, 3)."""
-        n = len(points)
-        gradient = np.zeros((2, 2 * n, 3))
-        gradient[0, n:, 2] = 1.0
-        gradient[1, :n, 2] = -1.0
-        return gradient
+        """Return the derivatives of the rigid motions, shape (D, D n, p)."""
+        n, D = len(points), self.dimension
+        gradient = np.zeros((D, D, n, D + len(TURNS[D])))
+        for j, (a, b) in enumerate(TURNS[D], start=D):
+            gradient[b, a, :, j], gradient[a, b, :, j] = -1.0, 1.0
+        return gradient.reshape(D, D * n, -1)

@@ -44,5 +44,5 @@ def landmark_stiffness(tissue: Tissue, grid: RegularGrid, kernel: Kernel, anchor
         x = scene.conditioned(grid.nodes[i : i + 1])
         own = abs(float(np.trace(scene.between(x, x)))) / c * unit
         if own > 0:  # a node on an anchor cannot move at all
-            stiffness[i] = 16.0 * np.pi / (own * excess[i])
+            stiffness[i] = kernel.per_spring / (own * excess[i])
     return stiffness

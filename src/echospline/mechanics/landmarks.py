@@ -2,37 +2,70 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from math import inf, isfinite
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from echospline.errors import InputError
-from echospline.scene import EDGES, Floats, RegularGrid, as_points
+from echospline.scene import EDGES, Floats, as_points
+
+SIDES = {"left": (0, 0), "right": (0, 1), "top": (1, 0), "bottom": (1, 1), "front": (2, 0), "back": (2, 1)}
+"""Axis, and 0 where its coordinate is least or 1 where it is greatest, of every edge (plane) or face (space)."""
+
+
+class Mesh(Protocol):
+    """Points at constant spacing, x fastest, in the plane (`RegularGrid`) or in space: D numbers each."""
+
+    @property
+    def shape(self) -> Sequence[int]:
+        """Number of points along x, y (and z)."""
+        ...
+
+    @property
+    def spacing(self) -> Sequence[float]:
+        """Distance between neighbours, mm."""
+        ...
+
+    @property
+    def origin(self) -> Sequence[float]:
+        """First point, mm."""
+        ...
+
+    @property
+    def nodes(self) -> Floats:
+        """All points in mm, shape (n, D)."""
+        ...
+
+    def nearest(self, point: ArrayLike) -> int:
+        """Index of the node nearest to one point in mm."""
+        ...
 
 
 @dataclass(frozen=True)
 class Clamps:
-    """What is held fast: whole edges of the mesh, and single points.
+    """What is held fast: whole edges of the mesh (faces in space), and single points.
 
     Parameters
     ----------
-    grid : RegularGrid
+    grid : Mesh
         The mesh.
-    edges : tuple of {"top", "bottom", "left", "right"}
-        Clamped edges.
-    points : ndarray, shape (k, 2)
+    edges : tuple of {"top", "bottom", "left", "right"}, in space also {"front", "back"}
+        Clamped edges or faces.
+    points : ndarray, shape (k, D)
         Further clamped points, mm.
     """
 
-    grid: RegularGrid
+    grid: Mesh
     edges: tuple[str, ...] = ("left", "right", "bottom")
     points: Floats = field(default_factory=lambda: np.empty((0, 2)))
 
     @classmethod
-    def of(cls, grid: RegularGrid, edges: Iterable[str], points: ArrayLike | None = None) -> Clamps:
+    def of(cls, grid: Mesh, edges: Iterable[str], points: ArrayLike | None = None) -> Clamps:
         """Check and keep what is clamped.
 
         Raises
@@ -40,56 +73,54 @@ class Clamps:
         InputError
             If an edge has another name or a point lies outside the mesh.
         """
-        names = tuple(edges)
+        names, D = tuple(edges), len(grid.shape)
+        known = EDGES if D == 2 else tuple(SIDES)
         for name in names:
-            if name not in EDGES:
-                raise InputError(f"an edge is one of {', '.join(EDGES)}; got {name!r}")
+            if name not in known:
+                raise InputError(f"an edge is one of {', '.join(known)}; got {name!r}")
         held = (
-            np.empty((0, 2))
+            np.empty((0, D))
             if points is None or np.size(points) == 0
-            else as_points(points, "clamped points")
+            else as_points(points, "clamped points", D)
         )
-        if not grid.contains(held).all():
+        low, high = _extent(grid)
+        if not ((held >= low) & (held <= high)).all():
             raise InputError("every clamped point must lie inside the mesh")
         return cls(grid, names, held)
 
     @cached_property
     def nodes(self) -> NDArray[np.intp]:
         """Clamped mesh nodes (the nearest ones for points), ascending: what finite elements hold."""
-        nearest = [self.grid.nearest(p) for p in self.points]
-        return np.unique(np.concatenate([self.grid.boundary(self.edges), np.array(nearest, dtype=np.intp)]))
+        index = _indices(self.grid)
+        held = [np.array([self.grid.nearest(p) for p in self.points], dtype=np.intp)]
+        for axis, side in (SIDES[edge] for edge in self.edges):
+            held.append(index.take(-side, axis=index.ndim - 1 - axis).ravel())
+        return np.unique(np.concatenate(held))
 
     def anchors(self, spacing: float) -> Floats:
-        """Anchor landmarks along the clamped edges, at most ``spacing`` mm apart, shape (b, 2) mm."""
-        x0, x1, y0, y1 = self.grid.extent
-        ends = {
-            "top": ((x0, y0), (x1, y0)),
-            "bottom": ((x0, y1), (x1, y1)),
-            "left": ((x0, y0), (x0, y1)),
-            "right": ((x1, y0), (x1, y1)),
-        }
-        lines = []
-        for edge in self.edges:
-            a, b = (np.array(end) for end in ends[edge])
-            gaps = max(1, int(np.ceil(float(np.hypot(*(b - a))) / spacing - 1e-9)))
-            lines.append(a + np.linspace(0.0, 1.0, gaps + 1)[:, None] * (b - a))
-        every = np.vstack([*lines, self.points])
-        _, first = np.unique(np.round(every / 1e-6), axis=0, return_index=True)
-        distinct: Floats = every[np.sort(first)]
+        """Anchor landmarks along the clamped edges, at most ``spacing`` mm apart, shape (b, D) mm.
+
+        In a face they form a lattice, ``spacing`` mm apart along each direction.
+        """
+        low, high = _extent(self.grid)
+        every = []
+        for axis, side in (SIDES[edge] for edge in self.edges):
+            lines = [_line(a, b, spacing) for a, b in zip(low, high, strict=True)]
+            lines[axis] = (high if side else low)[axis : axis + 1]
+            every.append(_product(lines))
+        landmarks = np.vstack([*every, self.points])
+        _, first = np.unique(np.round(landmarks / 1e-6), axis=0, return_index=True)
+        distinct: Floats = landmarks[np.sort(first)]
         return distinct
 
-    def clearance(self, point: tuple[float, float]) -> float:
+    def clearance(self, point: Sequence[float]) -> float:
         """Distance in mm from a point to what is clamped; 0 on it and beyond it; infinite when nothing is."""
-        x0, x1, y0, y1 = self.grid.extent
-        to_edge = {
-            "top": point[1] - y0,
-            "bottom": y1 - point[1],
-            "left": point[0] - x0,
-            "right": x1 - point[0],
-        }
-        distances = [to_edge[edge] for edge in self.edges]
-        distances += [float(np.hypot(p[0] - point[0], p[1] - point[1])) for p in self.points]
-        return max(0.0, min(distances, default=float("inf")))
+        low, high = _extent(self.grid)
+        distances = []
+        for axis, side in (SIDES[edge] for edge in self.edges):
+            distances.append(high[axis] - point[axis] if side else point[axis] - low[axis])
+        distances += [np.linalg.norm(p - point) for p in self.points]
+        return max(0.0, float(min(distances, default=inf)))
 
 
 def contact_lattice(clamps: Clamps, spacing: float) -> NDArray[np.intp]:
@@ -110,11 +141,41 @@ def contact_lattice(clamps: Clamps, spacing: float) -> NDArray[np.intp]:
     ndarray of int, shape (k,)
         Ascending node indices.
     """
-    grid = clamps.grid
-    nx, ny = grid.shape
-    lines = []
-    for n, h in zip((nx, ny), grid.spacing, strict=True):
+    grid, lines = clamps.grid, []
+    for n, h in zip(grid.shape, grid.spacing, strict=True):
         stride = max(1, round(spacing / h))
         lines.append(np.arange((n - 1) % stride // 2, n, stride, dtype=np.intp))
-    lattice = (lines[1][:, None] * nx + lines[0][None, :]).ravel()
+    lattice = _indices(grid)[np.ix_(*lines[::-1])].ravel()
     return np.setdiff1d(lattice, clamps.nodes)
+
+
+def join_gap(grid: Mesh, lattice: NDArray[np.intp]) -> float:
+    """Distance from the tip within which no node joins, mm: a quarter of the smallest between lines of the lattice."""
+    nodes = grid.nodes[lattice]
+    gaps = [float(np.diff(np.unique(np.round(x, 9))).min(initial=inf)) for x in nodes.T]
+    least = min(gaps)
+    return 0.25 * (least if isfinite(least) else min(grid.spacing))
+
+
+def _extent(grid: Mesh) -> tuple[Floats, Floats]:
+    """First and last point, mm."""
+    low = np.array(grid.origin, dtype=np.float64)
+    return low, low + np.subtract(grid.shape, 1) * np.array(grid.spacing)
+
+
+def _indices(grid: Mesh) -> NDArray[np.intp]:
+    """Node indices with the axes reversed, [(z,) y, x]."""
+    return np.arange(np.prod(grid.shape), dtype=np.intp).reshape(tuple(grid.shape)[::-1])
+
+
+def _line(a: float, b: float, spacing: float) -> Floats:
+    """Return numbers from a to b, evenly and at most ``spacing`` apart."""
+    gaps = max(1, int(np.ceil((b - a) / spacing - 1e-9)))
+    line: Floats = a + np.linspace(0.0, 1.0, gaps + 1) * (b - a)
+    return line
+
+
+def _product(lines: Sequence[Floats]) -> Floats:
+    """Points whose coordinates are all choices from one line per axis, x fastest, shape (n, D)."""
+    axes = np.meshgrid(*lines[::-1], indexing="ij")[::-1]
+    return np.stack(axes, axis=-1).reshape(-1, len(lines))

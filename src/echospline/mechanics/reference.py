@@ -1,4 +1,4 @@
-"""The spline model read in plain NumPy: the reference with which the fast solver is compared."""
+"""The spline model read in plain NumPy, in the plane and in space: the reference with which the core is compared."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from echospline.mechanics.interaction import (
     CALM,
     LET_GO,
+    Pose,
     approach,
     friction,
     largest_share,
@@ -20,10 +21,10 @@ from echospline.mechanics.interaction import (
     tip_push,
 )
 from echospline.mechanics.kernels import Kernel
-from echospline.mechanics.landmarks import Clamps
+from echospline.mechanics.landmarks import Clamps, Mesh
 from echospline.mechanics.parameters import TPSParameters
 from echospline.mechanics.spline import Spline, factor
-from echospline.scene import ZERO_LENGTH, Floats, NeedlePose, RegularGrid
+from echospline.scene import ZERO_LENGTH, Floats
 
 Nodes = NDArray[np.intp]
 
@@ -34,9 +35,9 @@ class Tip:
 
     Parameters
     ----------
-    point : ndarray, shape (2,)
+    point : ndarray, shape (D,)
         Where it stands in the undeformed tissue, mm.
-    q : ndarray, shape (2,)
+    q : ndarray, shape (D,)
         Its displacement, mm.
     pushed : bool
         Whether the needle's tip is there and pushes; otherwise the needle has left it and it relaxes.
@@ -53,29 +54,29 @@ class TPSState:
 
     Parameters
     ----------
-    pose : NeedlePose or None
+    pose : Pose or None
         The last pose; None at rest.
     contacts : ndarray of int, shape (k,)
         Nodes that are landmarks now, ascending: in contact, or leaving.
     touching : ndarray of bool, shape (k,)
         Which of them touch the needle; the others have left it and relax.
-    q : ndarray, shape (k, 2)
+    q : ndarray, shape (k, D)
         Their displacements, mm.
     along : ndarray, shape (k,)
         Where on the shaft each was touched: distance from the entry, mm.
-    grip : ndarray, shape (k, 2)
+    grip : ndarray, shape (k, D)
         Displacement across the axis less the shaft's position when it was touched, mm.
     tip : Tip or None
         The tip's own landmark; None where the tip pushes nothing.
     field : Spline or None
         The displacement field; None where nothing is displaced.
-    lattice : ndarray, shape (K, 2), or None
+    lattice : ndarray, shape (K, D), or None
         The field at the nodes that may become contacts, mm; None where nothing is displaced.
     held_back : int
         Steps since rest in which the landmarks were slowed down so that the picture does not jump.
     """
 
-    pose: NeedlePose | None = None
+    pose: Pose | None = None
     contacts: Nodes = field(default_factory=lambda: np.empty(0, dtype=np.intp))
     touching: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, dtype=bool))
     q: Floats = field(default_factory=lambda: np.empty((0, 2)))
@@ -88,19 +89,21 @@ class TPSState:
 
 
 class Reference:
-    """Algorithm 2 in plain NumPy, a spline fitted anew at each step: the reference for the fast solver.
+    """Algorithm 2 in plain NumPy, a spline fitted anew at each step: the reference for the core.
+
+    The dimension D is that of the mesh.
 
     Parameters
     ----------
-    grid : RegularGrid
+    grid : Mesh
         The mesh.
     parameters : TPSParameters
         Of the interaction.
     kernel : Kernel
-        `ThinPlate` (the paper) or `Elastic`.
+        `ThinPlate` (the paper) or `Elastic`, of the mesh's dimension.
     clamps : Clamps
-        The clamped edges and points.
-    anchors : ndarray, shape (a, 2)
+        The clamped edges (faces) and points.
+    anchors : ndarray, shape (a, D)
         Landmarks along them that stay, mm.
     lattice : ndarray of int, shape (K,)
         Mesh nodes that may become contacts.
@@ -112,7 +115,7 @@ class Reference:
 
     def __init__(
         self,
-        grid: RegularGrid,
+        grid: Mesh,
         parameters: TPSParameters,
         kernel: Kernel,
         clamps: Clamps,
@@ -124,13 +127,13 @@ class Reference:
         self.grid, self.parameters, self.kernel, self.clamps = grid, parameters, kernel, clamps
         self.anchors, self.lattice, self.gap, self.stiffness = anchors, lattice, gap, stiffness
 
-    def advance(self, state: TPSState, pose: NeedlePose, dt: float) -> TPSState:
+    def advance(self, state: TPSState, pose: Pose, dt: float) -> TPSState:
         """State after the needle has moved to ``pose`` in ``dt`` seconds, Algorithm 2."""
         p = self.parameters
         axis = np.array(pose.axis)
-        before = state.pose or NeedlePose(pose.entry, pose.entry)
         immediate = p.loading == "immediate"
-        travel = inf if immediate else needle_travel(before, pose)
+        way = pose.depth if state.pose is None else needle_travel(state.pose, pose)
+        travel = inf if immediate else way
 
         old = state
         state = self._touch(old, pose, leave_at_once=immediate)
@@ -145,25 +148,30 @@ class Reference:
 
         tip = self._tip(old, state, q, pose, dt, travel)
         off = ~on
-        free = np.zeros((int(off.sum()), 2))
+        free = np.zeros_like(q[off])
         if off.any():
             without = self._fit(state.contacts[on], q[on], tip)
             free = free if without is None else without(nodes[off])
             q[off] = approach(relax(q[off], free, p.alpha3, dt), free, travel)
         displaced = state.q if old.tip is None else np.vstack([state.q, old.tip.q])
-        relaxed = float(np.hypot(*displaced.T).max(initial=0.0)) * -expm1(-p.alpha3 * dt)
+        relaxed = float(_lengths(displaced).max(initial=0.0)) * -expm1(-p.alpha3 * dt)
         state, tip = self._hold_back(old, state, q, tip, CALM * (travel + relaxed) + LET_GO)
 
         keep = np.ones(len(state.q), dtype=bool)
-        keep[off] = np.hypot(*(state.q[off] - free).T) > LET_GO
+        keep[off] = _lengths(state.q[off] - free) > LET_GO
         if not keep.all():
             state = _select(state, keep)
             state = replace(state, field=self._fit(state.contacts, state.q, tip))
             state = replace(state, lattice=self._on_lattice(state.field))
         return replace(state, pose=pose, tip=tip)
 
+    def rest(self) -> TPSState:
+        """State of tissue that no needle has touched."""
+        none = np.empty((0, self._dimension))
+        return TPSState(q=none, grip=none)
+
     def displacement_at(self, state: TPSState, points: ArrayLike) -> Floats:
-        """Displacement of any reference points (n, 2) mm, shape (n, 2), mm."""
+        """Displacement of any reference points (n, D) mm, shape (n, D), mm."""
         points = np.asarray(points, dtype=np.float64)
         return np.zeros(points.shape) if state.field is None else state.field(points)
 
@@ -183,7 +191,7 @@ class Reference:
         was = self._at_lattice(old)
         field = self._fit(new.contacts, q, tip)
         u = self._on_lattice(field)
-        if not isfinite(limit) or np.hypot(*(_zero(u, was) - was).T).max() <= limit:
+        if not isfinite(limit) or _lengths(_zero(u, was) - was).max(initial=0.0) <= limit:
             return replace(new, q=q, field=field, lattice=u), tip
         stay = None if tip is None else replace(tip, q=self.displacement_at(old, tip.point[None])[0])
         rest = _zero(self._on_lattice(self._fit(new.contacts, new.q, stay)), was) - was
@@ -196,13 +204,17 @@ class Reference:
             new, q=q, field=field, lattice=self._on_lattice(field), held_back=old.held_back + 1
         ), tip
 
+    @property
+    def _dimension(self) -> int:
+        return len(self.grid.shape)
+
     def _at_lattice(self, state: TPSState) -> Floats:
-        return np.zeros((len(self.lattice), 2)) if state.lattice is None else state.lattice
+        return np.zeros((len(self.lattice), self._dimension)) if state.lattice is None else state.lattice
 
     def _on_lattice(self, field: Spline | None) -> Floats | None:
         return None if field is None else field(self.grid.nodes[self.lattice])
 
-    def _distance(self, nodes: Floats, u: Floats, pose: NeedlePose) -> tuple[Floats, Floats]:
+    def _distance(self, nodes: Floats, u: Floats, pose: Pose) -> tuple[Floats, Floats]:
         """Distance from the entry along the axis, and d of equation (13), of nodes displaced by u; mm.
 
         Tissue that a tilting needle has pushed aside is still beside it: the part ``drag`` of the displacement
@@ -212,10 +224,10 @@ class Reference:
         offset = nodes + self.parameters.drag * _across(u, axis) - pose.entry
         along = offset @ axis
         beyond = along - np.clip(along, 0.0, pose.depth)
-        across = np.hypot(*_across(offset, axis).T)
-        return along, np.hypot(across, beyond)
+        aside = _across(offset, axis)
+        return along, np.sqrt((aside * aside).sum(axis=-1) + beyond * beyond)
 
-    def _touch(self, state: TPSState, pose: NeedlePose, *, leave_at_once: bool) -> TPSState:
+    def _touch(self, state: TPSState, pose: Pose, *, leave_at_once: bool) -> TPSState:
         """Let nodes join and leave; who joins has the displacement that the field already has there."""
         p, axis = self.parameters, np.array(pose.axis)
         points = self.grid.nodes[self.lattice]
@@ -247,7 +259,7 @@ class Reference:
         )
 
     def _tip(
-        self, old: TPSState, new: TPSState, q: Floats, pose: NeedlePose, dt: float, travel: float
+        self, old: TPSState, new: TPSState, q: Floats, pose: Pose, dt: float, travel: float
     ) -> Tip | None:
         """Return the tip's landmark, equation (12); None where the tip pushes nothing."""
         p, axis, point = self.parameters, np.array(pose.axis), np.asarray(pose.tip)
@@ -271,7 +283,7 @@ class Reference:
         old: TPSState,
         new: TPSState,
         q: Floats,
-        pose: NeedlePose,
+        pose: Pose,
         push: Floats | None,
         dt: float,
         travel: float,
@@ -280,21 +292,21 @@ class Reference:
         axis, point = np.array(pose.axis), np.asarray(pose.tip)
         # the tip of a needle that comes back to the landmark which it left takes it up again; one that pushes into
         # tissue where nodes still relax waits until they are gone: two landmarks in one place would tear the field
-        clear = (
-            np.hypot(*(self.grid.nodes[new.contacts[~new.touching]] - point).T).min(initial=inf) > self.gap
-        )
-        back = old.tip is None or old.tip.pushed or np.hypot(*(point - old.tip.point)) <= max(travel, LET_GO)
+        clear = _lengths(self.grid.nodes[new.contacts[~new.touching]] - point).min(initial=inf) > self.gap
+        back = old.tip is None or old.tip.pushed or _lengths(point - old.tip.point) <= max(travel, LET_GO)
         if push is None or not (clear and back):
             return None if old.tip is None else self._leaving_tip(old.tip, new, q, dt, travel)
         if old.tip is None and pose.speed <= 0:
             return None
         field = self._fit(new.contacts, q)
-        free = np.zeros(2) if field is None else field(point)[0]
+        free = np.zeros_like(point) if field is None else field(point)[0]
         # a tip that begins to push starts from the displacement that the tissue had there before the step
         was = self.displacement_at(old, point[None])[0] if old.tip is None else old.tip.q
         ahead = float(push @ axis)
         if pose.speed == 0:  # (17): at rest the whole field relaxes, the tip's push with the contacts
-            was = _across(was, axis) + relax(was, np.zeros(2), self.parameters.alpha3, dt) @ axis * axis
+            was = (
+                _across(was, axis) + relax(was, np.zeros_like(was), self.parameters.alpha3, dt) @ axis * axis
+            )
             ahead = min(float(was @ axis), ahead)
         wanted = ahead * axis + _across(free, axis)
         return Tip(point, approach(was[None], wanted[None], travel)[0])
@@ -302,8 +314,8 @@ class Reference:
     def _leaving_tip(self, tip: Tip, new: TPSState, q: Floats, dt: float, travel: float) -> Tip | None:
         """Let the landmark that the tip has left relax to the field without it, then go."""
         field = self._fit(new.contacts, q)
-        free = np.zeros(2) if field is None else field(tip.point)[0]
-        if np.hypot(*(tip.q - free)) <= LET_GO:
+        free = np.zeros_like(tip.q) if field is None else field(tip.point)[0]
+        if _lengths(tip.q - free) <= LET_GO:
             return None
         relaxed = relax(tip.q, free, self.parameters.alpha3, dt)
         return Tip(tip.point, approach(relaxed[None], free[None], travel)[0], pushed=False)
@@ -315,7 +327,7 @@ class Reference:
         landmarks = [self.anchors, self.grid.nodes[contacts]]
         moves = [np.zeros_like(self.anchors), q]
         if tip is not None:
-            apart = np.hypot(*(landmarks[1] - tip.point).T) > 1e-6  # a tip on a node speaks for it
+            apart = _lengths(landmarks[1] - tip.point) > 1e-6  # a tip on a node speaks for it
             contacts = contacts[apart]
             landmarks = [self.anchors, landmarks[1][apart], tip.point[None]]
             moves = [moves[0], q[apart], tip.q[None]]
@@ -333,8 +345,14 @@ class Reference:
         return np.concatenate(own)
 
 
+def _lengths(vectors: Floats) -> Floats:
+    """Lengths of vectors (..., D)."""
+    lengths: Floats = np.linalg.norm(vectors, axis=-1)
+    return lengths
+
+
 def _across(vectors: Floats, axis: Floats) -> Floats:
-    """Part of vectors (..., 2) across the axis; all of it where there is no axis."""
+    """Part of vectors (..., D) across the axis; all of it where there is no axis."""
     across: Floats = vectors - np.multiply.outer(vectors @ axis, axis)
     return across
 

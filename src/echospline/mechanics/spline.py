@@ -34,13 +34,13 @@ class Spline:
     ----------
     kernel : Kernel
         In conditioned coordinates (x - centre) / scale.
-    landmarks : ndarray, shape (m, 2)
+    landmarks : ndarray, shape (m, D)
         mm.
-    weights : ndarray, shape (m c, 2 / c)
+    weights : ndarray, shape (m c, D / c)
         w_i of equation (7), for the conditioned kernel.
-    motion : ndarray, shape (p, 2 / c)
+    motion : ndarray, shape (p, D / c)
         Coefficients a_0, a_1, a_2 of the affine (or rigid) part, conditioned.
-    centre : ndarray, shape (2,)
+    centre : ndarray, shape (D,)
         mm.
     scale : float
         mm.
@@ -54,26 +54,27 @@ class Spline:
     scale: float
 
     def __call__(self, points: ArrayLike) -> Floats:
-        """Displacement at points (n, 2) in mm, equation (9) less the identity, shape (n, 2) mm."""
+        """Displacement at points (n, D) in mm, equation (9) less the identity, shape (n, D) mm."""
         x, s = self._conditioned(points), self._conditioned(self.landmarks)
         field = self.kernel.matrix(x, s) @ self.weights + self.kernel.polynomial(x) @ self.motion
         return _as_vectors(field, self.kernel.components)
 
     def gradient(self, points: ArrayLike) -> Floats:
-        """Displacement gradient du_i/dx_j at points (n, 2) in mm, shape (n, 2, 2)."""
+        """Displacement gradient du_i/dx_j at points (n, D) in mm, shape (n, D, D)."""
         x, s = self._conditioned(points), self._conditioned(self.landmarks)
         by = self.kernel.gradient(x, s) @ self.weights + self.kernel.polynomial_gradient(x) @ self.motion
-        columns = [_as_vectors(by[j], self.kernel.components) for j in (0, 1)]
+        columns = [_as_vectors(slope, self.kernel.components) for slope in by]
         gradient: Floats = np.stack(columns, axis=-1) / self.scale
         return gradient
 
     def energy(self) -> float:
-        """Bending energy (1) (thin plate, per 16 pi, in conditioned units) or elastic energy: w' K w."""
+        """Bending energy (1) (thin plate, per 16 pi or 8 pi in space, in conditioned units) or elastic energy: w' K w."""
         s = self._conditioned(self.landmarks)
         return float(np.sum(self.weights * (self.kernel.matrix(s, s) @ self.weights)))
 
     def _conditioned(self, points: ArrayLike) -> Floats:
-        conditioned: Floats = (np.asarray(points, dtype=np.float64).reshape(-1, 2) - self.centre) / self.scale
+        x = np.asarray(points, dtype=np.float64).reshape(-1, self.kernel.dimension)
+        conditioned: Floats = (x - self.centre) / self.scale
         return conditioned
 
 
@@ -93,7 +94,7 @@ class FactoredSpline:
 
         Parameters
         ----------
-        displacements : array_like, shape (m, 2)
+        displacements : array_like, shape (m, D)
             Target minus source of each landmark, mm.
 
         Returns
@@ -107,13 +108,13 @@ class FactoredSpline:
         SolverError
             If the landmarks lie so that L cannot be solved to `RESIDUAL`.
         """
-        d = as_points(displacements, "displacements")
-        m, c = len(self.landmarks), self.kernel.components
+        m, c, D = len(self.landmarks), self.kernel.components, self.kernel.dimension
+        d = as_points(displacements, "displacements", D)
         if len(d) != m:
             raise InputError(
                 f"one displacement per landmark is needed: {m} landmarks, {len(d)} displacements"
             )
-        V = np.vstack([_as_blocks(d, c), np.zeros((len(self.system) - m * c, 2 // c))])
+        V = np.vstack([_as_blocks(d, c), np.zeros((len(self.system) - m * c, D // c))])
         solution = lu_solve(self.factors, V, check_finite=False)
         misfit = float(np.abs(self.system @ solution - V).max())
         if not misfit <= RESIDUAL * max(1.0, float(np.abs(d).max())):
@@ -133,12 +134,12 @@ def factor(kernel: Kernel, landmarks: ArrayLike, stiffness: ArrayLike | None = N
     ----------
     kernel : Kernel
         `ThinPlate` or `Elastic`.
-    landmarks : array_like, shape (m, 2)
-        Source points (rest positions), mm.
+    landmarks : array_like, shape (m, D)
+        Source points (rest positions), mm; D is the kernel's dimension.
     stiffness : array_like, shape (m,), optional
         How firmly each landmark holds its displacement (Rohr et al. 2001): the spline minimises
-        sum k |d - u|^2 + energy. Infinite (the default) interpolates. Thin plate: 1/mm^2, beside the bending
-        energy (1). Elastic: relative to the shear modulus.
+        sum k |d - u|^2 + energy. Infinite (the default) interpolates. Thin plate: 1/mm^2 (1/mm in space), beside the
+        bending energy (1). Elastic: relative to the shear modulus (mm in space).
 
     Returns
     -------
@@ -147,11 +148,13 @@ def factor(kernel: Kernel, landmarks: ArrayLike, stiffness: ArrayLike | None = N
     Raises
     ------
     InputError
-        If landmarks are too few, collinear, coincident or not finite, or a stiffness is not positive.
+        If landmarks are too few, on one line (in space: in one plane), coincident or not finite, or a stiffness is not
+        positive.
     """
-    points = as_points(landmarks, "landmarks")
-    m, c = len(points), kernel.components
-    need = 3 if c == 1 else 2
+    D, c = kernel.dimension, kernel.components
+    points = as_points(landmarks, "landmarks", D)
+    m = len(points)
+    need = D + 1 if c == 1 else D
     if m < need:
         raise InputError(f"a spline needs at least {need} landmarks; got {m}")
     if np.abs(points).max() > FARTHEST:
@@ -174,12 +177,12 @@ def factor(kernel: Kernel, landmarks: ArrayLike, stiffness: ArrayLike | None = N
 
 
 def compliance(kernel: Kernel, stiffness: Floats) -> Floats:
-    """Return the diagonal that a stiffness adds to K in unconditioned mm: 16 pi / k, for either kernel.
+    """Return the diagonal that a stiffness adds to K in unconditioned mm: 16 pi / k (8 pi / k for the thin plate in space).
 
-    Both kernels solve an equation whose right side is 16 pi times the point load, so a spring of stiffness k
-    between target and field adds 16 pi / k.
+    A kernel solves an equation whose right side is `Kernel.per_spring` times the point load, so a spring of stiffness k
+    between target and field adds that over k.
     """
-    added: Floats = 16.0 * np.pi / stiffness
+    added: Floats = kernel.per_spring / stiffness
     return added
 
 
@@ -188,20 +191,21 @@ def _refuse_degenerate(kernel: Kernel, points: Floats, x: Floats) -> None:
     if pairs:
         i, j = min(pairs)
         raise InputError(
-            f"landmarks {i} and {j} coincide at ({points[i, 0]:g}, {points[i, 1]:g}) mm; keep one of them"
+            f"landmarks {i} and {j} coincide at ({', '.join(f'{x:g}' for x in points[i])}) mm; keep one of them"
         )
     singular = np.linalg.svd(kernel.polynomial(x), compute_uv=False)
     if singular[-1] < 1e-9 * singular[0]:
+        flat = "in one plane" if kernel.dimension == 3 and kernel.components == 1 else "on one line"
         raise InputError(
-            f"the {len(points)} landmarks lie on one line, so a spline is not determined; add one beside it"
+            f"the {len(points)} landmarks lie {flat}, so a spline is not determined; add one beside it"
         )
 
 
 def _as_blocks(vectors: Floats, c: int) -> Floats:
-    """(m, 2) vectors as the right-hand side of a kernel with c components."""
+    """(m, D) vectors as the right-hand side of a kernel with c components."""
     return vectors if c == 1 else vectors.T.reshape(-1, 1)
 
 
 def _as_vectors(blocks: Floats, c: int) -> Floats:
     """Inverse of `_as_blocks`."""
-    return blocks if c == 1 else np.ascontiguousarray(blocks.reshape(2, -1).T)
+    return blocks if c == 1 else np.ascontiguousarray(blocks.reshape(c, -1).T)

@@ -8,7 +8,7 @@ each step; `mechanics.native` reaches the same numbers in the native core.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from math import inf, isfinite
+from math import isfinite
 from typing import Literal, get_args
 
 import numpy as np
@@ -16,10 +16,10 @@ from numpy.typing import ArrayLike
 
 from echospline.errors import InputError
 from echospline.mechanics.kernels import Kernel, ThinPlate
-from echospline.mechanics.landmarks import Clamps, contact_lattice
+from echospline.mechanics.landmarks import Clamps, contact_lattice, join_gap
 from echospline.mechanics.native import NativeState, NativeStep, Precision
 from echospline.mechanics.parameters import TPSParameters
-from echospline.mechanics.reference import Nodes, Reference, TPSState
+from echospline.mechanics.reference import Reference, TPSState
 from echospline.mechanics.spline import Spline, factor
 from echospline.scene import Floats, NeedlePose, RegularGrid
 
@@ -77,11 +77,13 @@ class TPSModel:
         self.grid = grid
         self.parameters = parameters or TPSParameters()
         self.kernel = kernel or ThinPlate()
+        if self.kernel.dimension != 2:
+            raise InputError("a mesh in the plane takes a kernel of the plane; got one of dimension 3")
         self.clamps = Clamps.of(grid, clamped, clamped_points)
         self.anchors = self.clamps.anchors(self.parameters.anchor_spacing)
         factor(self.kernel, self.anchors)  # refuses anchors that hold nothing, before any step is made
         self.lattice = contact_lattice(self.clamps, self.parameters.contact_spacing)
-        self.gap = 0.25 * _spacing(grid, self.lattice)
+        self.gap = join_gap(grid, self.lattice)
         self.stiffness: Floats | None = None
         if stiffness is not None:
             k = np.array(np.broadcast_to(np.asarray(stiffness, dtype=np.float64), (grid.size,)))
@@ -100,11 +102,13 @@ class TPSModel:
         )
         self.native: NativeStep | None = None
         if solver == "response":
-            self.native = NativeStep(grid, self.clamps, self.parameters, self.kernel, self.stiffness, precision)
+            self.native = NativeStep(
+                grid, self.clamps, self.parameters, self.kernel, self.stiffness, precision
+            )
 
     def rest(self) -> State:
         """State of tissue that no needle has touched."""
-        return TPSState() if self.native is None else self.native.rest()
+        return self.reference.rest() if self.native is None else self.native.rest()
 
     def displacement(self, state: State) -> Floats:
         """Displacement of the mesh nodes, shape (n, 2), mm."""
@@ -148,10 +152,3 @@ class TPSModel:
         if self.native is None:
             raise InputError('this state belongs to a model with the solver "response"; this one has "refit"')
         return self.native
-
-
-def _spacing(grid: RegularGrid, lattice: Nodes) -> float:
-    """Smallest distance between neighbouring lines of the lattice, mm."""
-    gaps = [float(np.diff(np.unique(np.round(grid.nodes[lattice, i], 9))).min(initial=inf)) for i in (0, 1)]
-    least = min(gaps)
-    return least if isfinite(least) else min(grid.spacing)

@@ -17,19 +17,21 @@ Edge = Literal["top", "bottom", "left", "right"]
 EDGES: tuple[Edge, ...] = get_args(Edge)
 
 
-def as_points(points: ArrayLike, name: str = "points") -> Floats:
+def as_points(points: ArrayLike, name: str = "points", dimension: int = 2) -> Floats:
     """Check points and return them as an array.
 
     Parameters
     ----------
-    points : array_like, shape (n, 2) or (2,)
-        (x lateral, y depth) in mm.
+    points : array_like, shape (n, dimension) or (dimension,)
+        (x lateral, y depth) in mm, in space (x lateral, y depth, z elevation).
     name : str
         Name of the points in an error message.
+    dimension : int
+        2 in the plane, 3 in space.
 
     Returns
     -------
-    ndarray, shape (n, 2), float64
+    ndarray, shape (n, dimension), float64
 
     Raises
     ------
@@ -37,8 +39,9 @@ def as_points(points: ArrayLike, name: str = "points") -> Floats:
         If the shape is another or a coordinate is not finite.
     """
     array = np.atleast_2d(np.asarray(points, dtype=np.float64))
-    if array.ndim != 2 or array.shape[1] != 2:
-        raise InputError(f"{name} must have shape (n, 2), (x lateral, y depth) in mm; got {np.shape(points)}")
+    if array.ndim != 2 or array.shape[1] != dimension:
+        axes = "x lateral, y depth" + (", z elevation" if dimension == 3 else "")
+        raise InputError(f"{name} must have shape (n, {dimension}), ({axes}) in mm; got {np.shape(points)}")
     if not np.isfinite(array).all():
         bad = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
         raise InputError(f"{name} must be finite numbers in mm; got {tuple(array[bad])} at index {bad}")
