@@ -151,7 +151,8 @@ echospline_status null_argument(echospline_picture* picture, const char* name) {
 echospline_status check_mesh(echospline_picture* picture, const echospline::SceneCounts& tissue) {
   if (tissue.dimension != 2)
     return refuse(picture->message, ECHOSPLINE_WRONG_VALUE,
-                  "the tissue must be of dimension 2; got %d: give the plane's displacement to deform", tissue.dimension);
+                  "the tissue must be of dimension 2; got %d: give the plane's displacement to deform",
+                  tissue.dimension);
   const echospline_picture_options& o = picture->options;
   for (int d = 0; d < 2; ++d) {
     const double rounding = 1e-6 * tissue.spacing[d];
