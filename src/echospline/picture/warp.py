@@ -29,7 +29,7 @@ def warp(
     """Deform an image.
 
     A deformation of uint8, uint16, int16 or float32 pixels, grey or RGB, linear or nearest, is drawn by the native core.
-    Everything else (other types, RGBA, cubic, an inverse map) goes through the inverse map and ``cv2.remap``, which rounds
+    Everything else (other types, RGBA, cubic, an inverse map) goes through the inverse map and ``cv2.remap``, which may round
     positions to 1/32 of a pixel.
 
     Parameters
