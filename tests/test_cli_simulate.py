@@ -52,7 +52,7 @@ def test_a_run_leaves_everything_it_names(done):
     assert report["parameters"]["needle"]["depth"] == 6.0
     assert report["core"] == describe_core()
     assert set(report["milliseconds_per_frame"]) == {
-        "interaction", "spline", "inverse map", "warp", "needle", "write",
+        "interaction", "spline", "picture", "write",
     }  # fmt: skip
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,6 +13,7 @@ from PIL import Image
 
 from echospline.errors import InputError
 from echospline.mechanics import TPSParameters
+from echospline.picture import NeedleEcho
 from echospline.scenario import MODELS, Scenario, build_model, describe, load, validated
 from echospline.scenario.sections import LandmarkSection
 from echospline.scene import RegularGrid
@@ -80,6 +84,26 @@ def test_every_part_reaches_its_object(full):
     assert model.clamps.edges == ("left", "right")
 
 
+def test_the_needles_looks_are_the_cores_unless_the_file_says_otherwise(full):
+    assert load(full).needle_echo() == NeedleEcho()
+    given = load(full).with_values(
+        {
+            "needle.gauge": 22,
+            "needle.echo.lateral": 0.4,
+            "needle.echo.tail": False,
+            "needle.echo.apex": [25.0, -40.0],
+        }
+    )
+    assert given.needle_echo() == NeedleEcho(22, lateral=0.4, tail=False, apex=(25.0, -40.0))
+    assert given.with_values({"output.needle": False}).needle_echo() is None
+
+
+def test_the_core_is_loaded_when_a_scenario_is_made_and_not_before():
+    code = "import echospline.scenario, echospline.picture, echospline._native as n; print(n.library.cache_info().currsize)"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "0"
+
+
 def test_saved_and_loaded_again_it_is_the_same(full, tmp_path):
     scenario = load(full)
     elsewhere = tmp_path / "results" / "scenario.toml"
@@ -90,6 +114,8 @@ def test_saved_and_loaded_again_it_is_the_same(full, tmp_path):
     same = again.model_copy(update={"image": scenario.image})
     assert same == scenario
     assert "# push of the tip (12), mm" in elsewhere.read_text()
+    assert "[needle.echo]" in elsewhere.read_text()
+    assert "# level of the tip, dB" in elsewhere.read_text()
 
 
 @pytest.mark.parametrize(
@@ -106,6 +132,9 @@ def test_saved_and_loaded_again_it_is_the_same(full, tmp_path):
         ({"mesh": {"nodes": [1, 30]}}, ["mesh.nodes", "greater than or equal to 2"]),
         ({"tissue": {"region": [{"young": -1}]}}, ["tissue.region.0.young = -1"]),
         ({"model": {"kind": "spring"}}, ["model.kind = 'spring'", "'fem'"]),
+        ({"needle": {"echo": {"latral": 1}}}, ["needle.echo.latral", "did you mean lateral"]),
+        ({"needle": {"echo": {"opacity": 2.0}}}, ["needle.echo", "opacity of a needle must be from 0 to 1"]),
+        ({"output": {"inverse": "fast"}}, ["output.inverse = 'fast'", "'exact'"]),
         ({"format": 2}, ["format = 2", "1"]),
         ({"image": 3}, ["image = 3"]),
     ],

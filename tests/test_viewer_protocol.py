@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import struct
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from echospline.live import Command, LiveEngine, Snapshot
 from echospline.mechanics import Elastic, ThinPlate
 from echospline.mechanics.spline import factor
 from echospline.scene import NeedlePose
+from echospline.viewer import served_scene
 from echospline.viewer.protocol import (
     COMMAND_BYTES,
     FRAME_HEADER_BYTES,
@@ -28,7 +30,8 @@ from echospline.viewer.protocol import (
     encode_command,
     encode_frame,
 )
-from live_scene import MESH, models
+from echospline.viewer.served_scene import PAGE_LOOK
+from live_scene import MESH, models, scene
 
 GOLDEN = json.loads((Path(__file__).parent / "golden" / "viewer.json").read_text())
 SNAPSHOT = Snapshot(
@@ -207,3 +210,10 @@ def test_requests_are_read():
     assert decode_request('{"do": "compare", "name": null}').name is None
     assert decode_request('{"do": "start", "exercise": "a"}').trainee == ""
     assert decode_request('{"do": "finish"}').keep is True
+
+
+def test_the_page_gets_every_number_of_the_needle_that_its_renderer_reads():
+    static = Path(served_scene.__file__).parent / "static"
+    read = set(re.findall(r"\becho\??\.(\w+)", (static / "renderer.js").read_text()))
+    assert read == {*PAGE_LOOK, "diameter", "apex"}
+    assert set(scene().describe()["needle"]["echo"]) == read

@@ -8,11 +8,13 @@
 
 #include "../include/echospline/echospline.h"
 #include "picture_entries.hpp"
+#include "tissue_entries.hpp"
 
 struct echospline_picture {
   const echospline::Level* level;
   void* picture;  // nullptr after a create that failed
   echospline_picture_options options;
+  double* field;  // displacement of a tissue in double precision; nullptr before one is followed
   echospline::Message message;
 };
 
@@ -145,6 +147,43 @@ echospline_status null_argument(echospline_picture* picture, const char* name) {
   return refuse(picture->message, ECHOSPLINE_NULL_POINTER, "%s must not be NULL", name);
 }
 
+/// Does the picture have a tissue's mesh?
+echospline_status check_mesh(echospline_picture* picture, const echospline::SceneCounts& tissue) {
+  if (tissue.dimension != 2)
+    return refuse(picture->message, ECHOSPLINE_WRONG_VALUE,
+                  "the tissue must be of dimension 2; got %d: give the plane's displacement to deform",
+                  tissue.dimension);
+  const echospline_picture_options& o = picture->options;
+  for (int d = 0; d < 2; ++d) {
+    const double rounding = 1e-6 * tissue.spacing[d];
+    if (o.mesh_shape[d] != tissue.shape[d] || !(std::fabs(o.mesh_spacing[d] - tissue.spacing[d]) <= rounding) ||
+        !(std::fabs(o.mesh_origin[d] - tissue.origin[d]) <= rounding))
+      return refuse(
+          picture->message, ECHOSPLINE_WRONG_SIZE,
+          "the picture's mesh must be the tissue's, %d x %d nodes of %g x %g mm from (%g, %g); got %d x %d of %g x %g "
+          "from (%g, %g)",
+          tissue.shape[0], tissue.shape[1], tissue.spacing[0], tissue.spacing[1], tissue.origin[0], tissue.origin[1],
+          o.mesh_shape[0], o.mesh_shape[1], o.mesh_spacing[0], o.mesh_spacing[1], o.mesh_origin[0], o.mesh_origin[1]);
+  }
+  return ECHOSPLINE_OK;
+}
+
+/// Is a tissue's displacement near enough to be drawn? Node n has (x[n * step], y[n * step]).
+template <class Real>
+echospline_status check_field(echospline_picture* picture, const Real* x, const Real* y, int64_t step, int64_t nodes) {
+  for (int64_t k = 0; k < nodes; ++k)
+    if (!near_enough(x[k * step]) || !near_enough(y[k * step]))
+      return refuse(picture->message, ECHOSPLINE_WRONG_VALUE,
+                    "the tissue's displacement must be below %g mm to be drawn; node %lld has (%g, %g)", FURTHEST,
+                    static_cast<long long>(k), static_cast<double>(x[k * step]), static_cast<double>(y[k * step]));
+  return ECHOSPLINE_OK;
+}
+
+echospline_status field_failed(echospline_picture* picture, echospline_status status) {
+  return refuse(picture->message, status, "the tissue's displacement cannot be evaluated: %s",
+                echospline_status_text(status));
+}
+
 template <class Real>
 echospline_status check_displacement(echospline_picture* picture, const Real* displacement, int64_t count) {
   if (const echospline_status status = check_handle(picture)) return status;
@@ -231,6 +270,7 @@ echospline_status echospline_picture_create(const echospline_picture_options* op
 void echospline_picture_destroy(echospline_picture* picture) {
   if (!picture) return;
   if (picture->picture) picture->level->picture->destroy(picture->picture);
+  std::free(picture->field);
   std::free(picture);
 }
 
@@ -270,6 +310,30 @@ echospline_status echospline_picture_deform_single(echospline_picture* picture, 
                                                    int64_t count) {
   if (const echospline_status status = check_displacement(picture, displacement, count)) return status;
   picture->level->picture->deform_single(picture->picture, displacement);
+  return ECHOSPLINE_OK;
+}
+
+echospline_status echospline_picture_follow(echospline_picture* picture, echospline_tissue* tissue) {
+  if (const echospline_status status = check_handle(picture)) return status;
+  echospline::TissueView from;
+  if (const echospline_status status = echospline::view_of(tissue, from, picture->message)) return status;
+  if (const echospline_status status = check_mesh(picture, *from.counts)) return status;
+  const int64_t nodes = from.counts->nodes;
+  const float *x, *y;
+  if (const echospline_status status = from.functions->planes(from.self, &x, &y)) return field_failed(picture, status);
+  if (x) {
+    if (const echospline_status status = check_field(picture, x, y, 1, nodes)) return status;
+    picture->level->picture->deform_planes(picture->picture, x, y);
+    return ECHOSPLINE_OK;
+  }
+  // a field in double precision: converted through memory that is reserved at the first call
+  if (!picture->field) picture->field = static_cast<double*>(std::malloc(sizeof(double) * 2 * nodes));
+  double* field = picture->field;
+  if (!field) return refuse(picture->message, ECHOSPLINE_OUT_OF_MEMORY, "memory for the tissue's displacement ran out");
+  if (const echospline_status status = from.functions->displacement(from.self, field))
+    return field_failed(picture, status);
+  if (const echospline_status status = check_field(picture, field, field + 1, 2, nodes)) return status;
+  picture->level->picture->deform(picture->picture, field);
   return ECHOSPLINE_OK;
 }
 

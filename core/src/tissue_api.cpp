@@ -211,6 +211,14 @@ echospline_status usable(echospline_tissue* t) {
 
 }  // namespace
 
+echospline_status echospline::view_of(echospline_tissue* t, TissueView& view, Message& message) {
+  if (!t) return refuse(message, ECHOSPLINE_NULL_POINTER, "a tissue must be given; got NULL");
+  if (!t->self)
+    return refuse(message, ECHOSPLINE_FAILED_HANDLE, "a tissue that works must be given; its create had failed");
+  view = {t->self, t->functions, &t->scene->counts};
+  return ECHOSPLINE_OK;
+}
+
 extern "C" {
 
 void echospline_scene_defaults(echospline_scene_options* o) {

@@ -7,6 +7,8 @@ namespace echospline {
 struct SceneCounts {
   int32_t dimension;
   int64_t nodes, anchors, sources;
+  int32_t shape[3];  // of the mesh
+  double spacing[3], origin[3];
 };
 
 /// Functions of one kind of tissue: dimension, kernel and precision.
@@ -41,5 +43,14 @@ struct TissueEntries {
                                     const SceneFunctions** functions, Message& message);
   echospline_status (*follow)(const echospline_pose& now, const echospline_command& command, echospline_pose& next);
 };
+
+/// A tissue for other parts of the interface.
+struct TissueView {
+  void* self;
+  const TissueFunctions* functions;
+  const SceneCounts* counts;
+};
+/// A status and a message where the handle is no tissue that works, else OK.
+echospline_status view_of(echospline_tissue* tissue, TissueView& view, Message& message);
 
 }  // namespace echospline

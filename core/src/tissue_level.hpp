@@ -208,7 +208,11 @@ struct Kind {
 
   static void destroy_scene(void* s) { destroy(static_cast<SceneOf*>(s)); }
   static SceneCounts counts(const void* s) {
-    return {D, scene(s).grid.size(), scene(s).anchored.anchors, scene(s).sources()};
+    const Grid<D>& grid = scene(s).grid;
+    SceneCounts out = {D, grid.size(), scene(s).anchored.anchors, scene(s).sources(), {}, {}, {}};
+    for (int d = 0; d < D; ++d)
+      out.shape[d] = grid.shape[d], out.spacing[d] = grid.spacing[d], out.origin[d] = grid.origin[d];
+    return out;
   }
   static void anchors(const void* s, double* out) {
     const SceneOf& own = scene(s);

@@ -62,7 +62,7 @@ class Session {
   }
 
   void act() {
-    switch (choices_.below(28)) {
+    switch (choices_.below(38)) {
       case 0: open(); break;
       case 1: reset(); break;
       case 2:
@@ -77,6 +77,14 @@ class Session {
       case 11: getters(); break;
       case 12: follow(); break;
       case 13: nothing(); break;
+      case 14:
+      case 15: open_picture(); break;
+      case 16:
+      case 17: deform(); break;
+      case 18: follow_tissue(); break;
+      case 19:
+      case 20:
+      case 21: draw(); break;
       default: advance(); break;
     }
   }
@@ -149,7 +157,8 @@ class Session {
       require(scene_ && where, "a scene was made of nothing");
       dimension_ = o.dimension, nodes_ = echospline_scene_node_count(scene_);
       require(nodes_ == nodes || nodes == 0, "the scene's nodes are not its shape's");
-      for (int k = 0; k < 3; ++k) origin_[k] = o.origin[k], extent_[k] = o.spacing[k] * (o.shape[k] - 1.0);
+      for (int k = 0; k < 3; ++k)
+        shape_[k] = o.shape[k], origin_[k] = o.origin[k], extent_[k] = o.spacing[k] * (o.shape[k] - 1.0);
     }
     const echospline_status made = echospline_tissue_create(given() ? scene_ : nullptr, given() ? &tissue_ : nullptr);
     known(made, echospline_tissue_message(tissue_), tissue_ != nullptr);
@@ -305,6 +314,9 @@ class Session {
       o.mesh_spacing[k] = choices_.number(0.5, 3);
       if (choices_.below(4) == 0) o.origin[k] = choices_.number(-5, 5), o.mesh_origin[k] = choices_.number(-5, 5);
     }
+    if (choices_.below(2))  // the mesh of the scene, so that the picture can follow its tissue
+      for (int k = 0; k < 2; ++k)
+        o.mesh_shape[k] = shape_[k], o.mesh_spacing[k] = extent_[k] / (shape_[k] - 1.0), o.mesh_origin[k] = origin_[k];
     if (choices_.below(4) == 0) o.border_value = choices_.number(0, 300);
     if (choices_.below(4) == 0) o.white = choices_.number(0, 300);
     const bool small =
@@ -331,6 +343,13 @@ class Session {
       drawn(p, echospline_picture_deform(p, given() ? field.data() : nullptr, count));
     else
       drawn(p, echospline_picture_deform_single(p, given() ? single.data() : nullptr, count));
+  }
+
+  void follow_tissue() {
+    echospline_picture* p = picture();
+    echospline_tissue* t = tissue();
+    const echospline_status status = drawn(p, echospline_picture_follow(p, t));
+    if (!t || dimension_ != 2) require(status != ECHOSPLINE_OK, "a picture followed no tissue of the plane");
   }
 
   void draw() {
@@ -408,6 +427,7 @@ class Session {
   bool good_ = false;
   int64_t nodes_ = 0;
   int dimension_ = 2;
+  int32_t shape_[3] = {2, 2, 2};
   double origin_[3] = {0, 0, 0}, extent_[3] = {10, 10, 10}, entry_[3] = {5, 0, 5};
   std::vector<uint8_t> saved_;  // lives longer than its scene: a state of another scene has to be refused
 };

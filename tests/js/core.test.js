@@ -123,6 +123,26 @@ test("a picture is drawn deformed and with a needle", { skip }, () => {
   picture.destroy();
 });
 
+test("a picture follows a tissue of its mesh", { skip }, () => {
+  const mesh = { shape: [13, 10, 1], spacing: [2, 2, 1] };
+  const scene = core.scene({ dimension: 2, ...mesh });
+  const tissue = scene.tissue();
+  tissue.advance({ entry: [10, 0, 0], tip: [12, 8, 0], speed: 10, dt: 0.1 });
+  const options = { columns: 60, rows: 45, spacing: [0.4, 0.4], mesh_shape: [13, 10], mesh_spacing: [2, 2] };
+  const pixels = Uint8Array.from({ length: 60 * 45 }, (_, i) => (7 * i) % 251);
+  const picture = core.picture(options, pixels);
+  picture.deform(Float32Array.from(tissue.displacement()));
+  const deformed = Uint8Array.from(picture.draw(null));
+  assert.notDeepEqual(deformed, pixels);
+  picture.deform(new Float32Array(2 * 13 * 10));
+  picture.follow(tissue);
+  const followed = picture.draw(null);
+  assert.ok(deformed.every((value, i) => Math.abs(value - followed[i]) <= 1));
+  const other = core.picture({ ...options, mesh_shape: [12, 10] }, pixels);
+  assert.throws(() => other.follow(tissue), /mesh must be the tissue's/);
+  for (const thing of [other, picture, tissue, scene]) thing.destroy();
+});
+
 test("structs are laid out as the compiler lays them out", { skip: process.env.ECHOSPLINE_WASM_LAYOUTS ? false : "no layouts given" }, () => {
   const given = JSON.parse(readFileSync(process.env.ECHOSPLINE_WASM_LAYOUTS, "utf8"));
   const ours = Object.fromEntries(Object.entries(LAYOUTS).map(([name, { size, fields }]) => [

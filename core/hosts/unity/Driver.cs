@@ -50,7 +50,7 @@ public static class Driver
             {
                 Require(error.Status == Status.WrongSize && error.Message.Length > 0, "a wrong size is refused");
             }
-            DrawPicture(field, pose);
+            DrawPicture(tissue, field, pose);
             tissue.Reset();
             tissue.Displacement(field);
             foreach (var u in field) Require(u == 0, "rest is rest");
@@ -60,7 +60,7 @@ public static class Driver
         return 0;
     }
 
-    private static void DrawPicture(float[] field, Pose pose)
+    private static void DrawPicture(Tissue tissue, float[] field, Pose pose)
     {
         var options = PictureOptions.Defaults();
         options.Columns = 200;
@@ -84,6 +84,12 @@ public static class Driver
             for (int i = 0; i < drawn.Length; ++i) changed += drawn[i] != still[i] ? 1 : 0;
             Require(changed > drawn.Length / 10, "the picture deforms");
             Require(picture.Report().Residual < 0.1, "the inverse is good to a tenth of a pixel");
+
+            picture.Deform(new float[field.Length]);
+            picture.Follow(tissue);
+            var followed = new byte[picture.Size];
+            picture.Draw(ref needle, followed);
+            for (int i = 0; i < drawn.Length; ++i) Require(Math.Abs(drawn[i] - followed[i]) <= 1, "a picture follows its tissue");
         }
     }
 

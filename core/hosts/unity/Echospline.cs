@@ -321,6 +321,8 @@ namespace Echospline
         private readonly Scene scene;  // lives as long as its tissues
         private IntPtr handle;
 
+        internal IntPtr Handle { get { return handle; } }
+
         public Tissue(Scene scene)
         {
             this.scene = scene;
@@ -437,6 +439,9 @@ namespace Echospline
         /// <summary>The same in single precision.</summary>
         public void Deform(float[] field) { Check(Native.echospline_picture_deform_single(handle, field, field.LongLength)); }
 
+        /// <summary>Deform as a tissue in the plane is now, straight from its field; the mesh has to be the tissue's.</summary>
+        public void Follow(Tissue tissue) { Check(Native.echospline_picture_follow(handle, tissue.Handle)); }
+
         /// <summary>Draw into bytes, without a needle.</summary>
         public void Draw(byte[] bytes) { Check(Native.echospline_picture_draw(handle, IntPtr.Zero, bytes, bytes.LongLength)); }
 
@@ -548,6 +553,7 @@ namespace Echospline
         [DllImport(Library)] internal static extern Status echospline_picture_reference(IntPtr picture, IntPtr pixels, long bytes);
         [DllImport(Library)] internal static extern Status echospline_picture_deform(IntPtr picture, double[] displacement, long count);
         [DllImport(Library)] internal static extern Status echospline_picture_deform_single(IntPtr picture, float[] displacement, long count);
+        [DllImport(Library)] internal static extern Status echospline_picture_follow(IntPtr picture, IntPtr tissue);
         [DllImport(Library)] internal static extern Status echospline_picture_draw(IntPtr picture, IntPtr needle, [Out] byte[] bytes, long size);
         [DllImport(Library)] internal static extern Status echospline_picture_draw(IntPtr picture, ref Needle needle, [Out] byte[] bytes, long size);
         [DllImport(Library)] internal static extern Status echospline_picture_inverse(IntPtr picture, [Out] float[] x, [Out] float[] y, long count);

@@ -340,6 +340,10 @@ ECHOSPLINE_API echospline_status echospline_picture_deform(echospline_picture* p
 ECHOSPLINE_API echospline_status echospline_picture_deform_single(echospline_picture* picture,
                                                                   const float* displacement, int64_t count);
 
+/* Deform as a tissue in the plane is now, straight from its field. The picture's mesh has to be the tissue's; levels and
+ * precision may differ. The tissue is only read, and may go on or be destroyed afterwards. */
+ECHOSPLINE_API echospline_status echospline_picture_follow(echospline_picture* picture, echospline_tissue* tissue);
+
 /* Draw into bytes of the caller's; needle may be NULL. */
 ECHOSPLINE_API echospline_status echospline_picture_draw(echospline_picture* picture, const echospline_needle* needle,
                                                          void* out, int64_t bytes);

@@ -331,6 +331,7 @@ FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {  # name: result, arguments; hand
     "echospline_picture_reference": (c_int32, [c_void_p, c_void_p, c_int64]),
     "echospline_picture_deform": (c_int32, [c_void_p, c_void_p, c_int64]),
     "echospline_picture_deform_single": (c_int32, [c_void_p, c_void_p, c_int64]),
+    "echospline_picture_follow": (c_int32, [c_void_p, c_void_p]),
     "echospline_picture_draw": (c_int32, [c_void_p, POINTER(Needle), c_void_p, c_int64]),
     "echospline_picture_inverse": (c_int32, [c_void_p, c_void_p, c_void_p, c_int64]),
     "echospline_picture_check": (c_int32, [c_void_p, POINTER(PictureReport)]),

@@ -540,6 +540,11 @@ export class Picture {
     this.check(deform(this.handle, this.field, BigInt(this.numbers)));
   }
 
+  /** Deform as a tissue in the plane is now; the mesh has to be the tissue's. @param {Tissue} tissue */
+  follow(tissue) {
+    this.check(this.core.functions.echospline_picture_follow(this.handle, tissue.handle));
+  }
+
   /** Draw the picture: a view. @param {Needle | null} needle @returns {Pixels} */
   draw(needle) {
     const at = needle === null ? 0 : this.placeNeedle(needle);

@@ -152,7 +152,7 @@ def scene_of(scenario: Scenario, image: UltrasoundImage, folder: Path) -> Scene:
         names=tuple((kind, LABELS[kind]) for kind in sorted(MODELS, key=lambda kind: kind != first)),
         entry=entry,
         angle=angle,
-        echo=scenario.needle_echo() or NeedleEcho(shaft=False, tip=False, reverberation=False, shadow=False),
+        echo=scenario.needle_echo() or NeedleEcho(shaft=False, tip=False, tail=False, shadow=False),
         exercises=tuple(scenario.exercise) or default_exercises(grid),
         source=kept.model_dump_json(),
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -12,8 +12,8 @@ from echospline.openigtlink.message import Message
 from echospline.openigtlink.polydata import Attribute, Point, Points, PolyData
 from echospline.openigtlink.pose import Transform
 from echospline.openigtlink.transforms import Naming
-from echospline.picture import Deformation, NeedleEcho, draw_needle, warp
-from echospline.scene import ImagingPlane, Pixels, RegularGrid, UltrasoundImage, Visible
+from echospline.picture import Drawing, NeedleEcho
+from echospline.scene import ImagingPlane, Pixels, RegularGrid, Visible
 
 ORIENTATION = {"UltrasoundImageOrientation": "MF"}
 """Metadata of every image: columns grow to the marked side of the probe, rows away from it."""
@@ -39,17 +39,13 @@ class Looks:
     echo: NeedleEcho | None = field(default_factory=NeedleEcho)
 
 
-def draw(
-    image: UltrasoundImage, grid: RegularGrid, snapshot: Snapshot, visible: Visible | None, looks: Looks
-) -> Pixels:
+def draw(drawing: Drawing, snapshot: Snapshot, visible: Visible | None, looks: Looks) -> Pixels:
     """Draw the deformed pixels with the part of the needle inside the beam.
 
     Parameters
     ----------
-    image : UltrasoundImage
-        At rest.
-    grid : RegularGrid
-        The mesh of the snapshot's displacement.
+    drawing : Drawing
+        Of the image at rest, with the mesh of the snapshot's displacement.
     snapshot : Snapshot
         The scene.
     visible : Visible or None
@@ -57,15 +53,10 @@ def draw(
     looks : Looks
         Naming and looks.
     """
-    picture = warp(image, Deformation(grid, snapshot.displacement))
-    if looks.echo is not None and visible is not None:
-        faded = replace(
-            looks.echo,
-            brightness=looks.echo.brightness * visible.brightness,
-            opacity=looks.echo.opacity * visible.brightness,
-        )
-        picture = draw_needle(picture, visible.of(snapshot.pose), faded)
-    return picture.pixels
+    if looks.echo is None or visible is None:
+        return drawing.draw(snapshot.displacement).image.pixels
+    echo = looks.echo.fainter(visible.brightness)
+    return drawing.draw(snapshot.displacement, visible.of(snapshot.pose), echo).image.pixels
 
 
 def image_message(

@@ -19,6 +19,7 @@ from echospline.openigtlink.outgoing import (
 from echospline.openigtlink.stage import Rates, Stage
 from echospline.openigtlink.status import status_of
 from echospline.openigtlink.transforms import Located
+from echospline.picture import Drawing
 from echospline.scene import Pixels, Reach, TrackedNeedle, Visible
 
 log = logging.getLogger("echospline.openigtlink")
@@ -40,6 +41,7 @@ class Painter:
     def __init__(self, looks: Looks, reach: Reach, rates: Rates) -> None:
         self.looks, self.reach, self.rates = looks, reach, rates
         self._last: tuple[Stage, Snapshot, Visible | None] | None = None
+        self._drawing: Drawing | None = None
         self._pixels: Pixels | None = None
         self._mesh_due = self._status_due = 0.0
 
@@ -52,7 +54,10 @@ class Painter:
         grid = stage.engine.model.grid
         try:
             if self._pixels is None or self._last is None or _differs(self._last, (stage, snapshot, visible)):
-                self._pixels = draw(stage.image, grid, snapshot, visible, self.looks)
+                drawing = self._drawing
+                if drawing is None or drawing.image is not stage.image or drawing.mesh != grid:
+                    drawing = self._drawing = Drawing(stage.image, grid)
+                self._pixels = draw(drawing, snapshot, visible, self.looks)
             self._last = (stage, snapshot, visible)
             messages = self._scene(stage, snapshot, located, self._pixels, now)
             if self.rates.mesh and now >= self._mesh_due:

@@ -4,19 +4,23 @@
 """
 
 from echospline.picture.deformation import Deformation, InverseMap
-from echospline.picture.needle_echo import OUTER_DIAMETER, NeedleEcho, draw_needle
-from echospline.picture.simulate import Frame, ImageFormer, frame_count, simulate
+from echospline.picture.drawing import Drawing, Drawn, ImageFormer
+from echospline.picture.needle_echo import OUTER_DIAMETER, NeedleEcho, draw_needle, needle_echo
+from echospline.picture.simulate import Frame, frame_count, simulate
 from echospline.picture.warp import warp
 
 __all__ = [
     "OUTER_DIAMETER",
     "Deformation",
+    "Drawing",
+    "Drawn",
     "Frame",
     "ImageFormer",
     "InverseMap",
     "NeedleEcho",
     "draw_needle",
     "frame_count",
+    "needle_echo",
     "simulate",
     "warp",
 ]

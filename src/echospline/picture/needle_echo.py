@@ -1,23 +1,33 @@
-"""How a needle in the imaging plane looks: shaft, tip, reverberation and shadow, drawn into the deformed image.
+"""How a needle looks in B-mode: shaft, tip, ring-down and shadow, drawn into a picture by the native core.
 
-The picture is a model of appearance, not of acoustics: it has the traits by which a needle is known in
-B-mode. A smooth metal shaft mirrors sound, so its echo fades as it turns towards the beam; the bevelled tip
-scatters and stays visible; sound that runs to and fro in the tube gives equally spaced fainter copies
-further down the beam; and little sound passes, so what lies behind is darker.
+The echo follows what was measured on real needles (docs/theory.md, "The needle's picture"): one line from the near wall, bright
+only near perpendicular to the beam and faint and grainy beyond; a tip that stays bright; both added as power before log
+compression. It is a model of appearance: no sound is propagated.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from math import acos, degrees, exp, hypot, isfinite, sin
+import ctypes
+import functools
+from dataclasses import dataclass, field, fields, replace
+from math import log10
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
+from echospline import _native as core
 from echospline.errors import InputError
-from echospline.scene import ZERO_LENGTH, Floats, NeedlePose, UltrasoundImage, as_points
+from echospline.picture.native import NativePicture, blank
+from echospline.scene import (
+    ZERO_LENGTH,
+    Floats,
+    NeedlePose,
+    Pixels,
+    RegularGrid,
+    UltrasoundImage,
+    as_points,
+)
 
 OUTER_DIAMETER = {
     14: 2.108, 15: 1.829, 16: 1.651, 17: 1.473, 18: 1.270, 19: 1.067,
@@ -25,40 +35,74 @@ OUTER_DIAMETER = {
 }  # fmt: skip
 """Outer diameter in mm of hypodermic tubing by gauge (Birmingham gauge, the nominal sizes of ISO 9626)."""
 
-COPIES = 5
-COPY_LOSS = 0.65
-"""Reverberations drawn, and how much each is fainter than the one before."""
-NOTHING = 40.0
-"""Exponent beyond which exp(-x) is below 1e-17 and is not computed."""
-FAR_WALL = 0.6
-"""Echo of the tube's far wall relative to its near wall."""
+DIRECT = (np.uint8, np.uint16, np.int16)
+"""Types of pixels that the core draws into as they are; others are scaled so that white is 1."""
+
+
+@functools.cache
+def _defaults() -> core.Needle:
+    """Return the core's needle; it is not changed."""
+    needle = core.Needle(struct_size=ctypes.sizeof(core.Needle))
+    core.library().echospline_needle_defaults(ctypes.byref(needle))
+    return needle
+
+
+def _of_core(name: str) -> Any:
+    """Return a dataclass field whose default the core has."""
+    return field(default_factory=lambda: getattr(_defaults(), name))
 
 
 @dataclass(frozen=True)
 class NeedleEcho:
-    """What the needle looks like; each trait can be switched off.
+    """The needle's looks; each part can be switched off.
+
+    Levels are dB of power relative to white, sigmas are of amplitude. Defaults are the core's; they stand with their sources
+    in docs/theory.md.
 
     Parameters
     ----------
     gauge : int
         14 to 25; sets the diameter.
-    brightness : float
-        Strongest echo as a share of white, 0 to 1.
-    resolution : float
-        Half width of a thin line's echo in mm (to 1/e), positive.
-    fade_angle : float
-        Tilt from perpendicular to the beam, in degrees, at which the mirror echo has fallen to 1/e.
-    floor : float
-        Echo that is left at any angle, as a share of the strongest, 0 to 1.
-    opacity : float
-        Share of the brightness that the shadow takes behind a shaft perpendicular to the beam, 0 to 1.
-    refill : float
-        Way behind the shaft over which the shadow fades to 1/e, mm: the needle is thinner than the beam,
-        which closes again behind it.
+    shaft, tip, tail, shadow : bool
+        The parts: line of the near wall; tip and heel of the bevel; ring-down below a shaft across the beam; shadow.
     apex : (x, y), optional
-        Where the beams of a curved array meet, mm, above the image; a linear array's beams run straight down.
-    shaft, tip, reverberation, shadow : bool
-        The traits.
+        Where the beams of a curved array cross, mm, above the image; a linear array's beams run straight down.
+    lateral, axial : float
+        Resolution across and along the beam: sigma, 0.01 to 100 mm.
+    elevation : float
+        Thickness of the slice at its focus: sigma, 0.01 to 1000 mm.
+    elevation_depth : float
+        Depth of that focus, 0.1 to 10000 mm.
+    element_height : float
+        Height of the array across the plane, 0 to 1000 mm: the slice is thicker off its focus.
+    f_number : float
+        Depth over aperture, 0.1 to 100: sets the penumbra of the shadow.
+    dynamic_range : float
+        Of the display, 1 to 300 dB.
+    specular : float
+        Level of a shaft at right angles to the beam, before compounding, -300 to 60 dB.
+    lobe, lobe_elevation : float
+        Tilt at which that has fallen by 4.3 dB, in the plane and out of it, 0.1 to 90 degrees.
+    steering : float
+        Beams are compounded at 0 and plus and minus this, 0 (no compounding) to 60 degrees.
+    roughness : float
+        Level of the grain that is left at any tilt, -300 to 60 dB.
+    rolloff : float
+        Loss of the grain from 50 to 90 degrees of tilt, 0 to 100 dB.
+    wobble : float
+        Standard deviation of slow changes along the shaft, 0 to 20 dB.
+    patches : float
+        Standard deviation of the grain's level from patch to patch of 1.5 mm, 0 to 20 dB.
+    bevel : float
+        Level of the tip, -300 to 60 dB.
+    ring_down : float
+        First level of the tail relative to the specular echo, -300 to 0 dB.
+    ring_down_loss : float
+        Loss along the tail, 0.1 to 1000 dB/mm.
+    opacity : float
+        Share of a blocked ray that is lost, 0 to 1.
+    seed : int
+        Of the grain, which is fixed to the needle.
 
     Raises
     ------
@@ -67,44 +111,88 @@ class NeedleEcho:
     """
 
     gauge: int = 18
-    brightness: float = 0.9
-    resolution: float = 0.3
-    fade_angle: float = 40.0
-    floor: float = 0.3
-    opacity: float = 0.45
-    refill: float = 25.0
-    apex: tuple[float, float] | None = None
     shaft: bool = True
     tip: bool = True
-    reverberation: bool = True
+    tail: bool = True
     shadow: bool = True
+    apex: tuple[float, float] | None = None
+    lateral: float = _of_core("lateral")
+    axial: float = _of_core("axial")
+    elevation: float = _of_core("elevation")
+    elevation_depth: float = _of_core("elevation_depth")
+    element_height: float = _of_core("element_height")
+    f_number: float = _of_core("f_number")
+    dynamic_range: float = _of_core("dynamic_range")
+    specular: float = _of_core("specular")
+    lobe: float = _of_core("lobe")
+    lobe_elevation: float = _of_core("lobe_elevation")
+    steering: float = _of_core("steering")
+    roughness: float = _of_core("roughness")
+    rolloff: float = _of_core("rolloff")
+    wobble: float = _of_core("wobble")
+    patches: float = _of_core("patches")
+    bevel: float = _of_core("bevel")
+    ring_down: float = _of_core("ring_down")
+    ring_down_loss: float = _of_core("ring_down_loss")
+    opacity: float = _of_core("opacity")
+    seed: int = _of_core("seed")
 
     def __post_init__(self) -> None:
         if self.gauge not in OUTER_DIAMETER:
             raise InputError(
                 f"gauge must be a whole number from {min(OUTER_DIAMETER)} to {max(OUTER_DIAMETER)}; got {self.gauge}"
             )
-        for name in ("brightness", "floor", "opacity"):
-            value = getattr(self, name)
-            if not 0 <= value <= 1:
-                raise InputError(f"{name} must be between 0 and 1; got {value}")
-        for name, unit in (("resolution", "mm"), ("fade_angle", "degrees"), ("refill", "mm")):
-            value = getattr(self, name)
-            if not (isfinite(value) and value > 0):
-                raise InputError(f"{name} must be a positive number in {unit}; got {value}")
         if self.apex is not None:
             as_points(self.apex, "apex")
+        if not 0 <= self.seed < 2**32:
+            raise InputError(f"seed must be a whole number from 0 to {2**32 - 1}; got {self.seed}")
+        needle_echo(np.empty((0, 2)), NeedlePose((0.0, 0.0), (0.0, 1.0)), self)  # the core checks the ranges
 
     @property
     def diameter(self) -> float:
         """Outer diameter, mm."""
         return OUTER_DIAMETER[self.gauge]
 
+    def fainter(self, share: float) -> NeedleEcho:
+        """Return the looks of a needle whose echo has ``share`` of the amplitude, above 0 to 1."""
+        loss = 20 * log10(share)
+        return replace(
+            self,
+            specular=self.specular + loss,
+            roughness=self.roughness + loss,
+            bevel=self.bevel + loss,
+            opacity=self.opacity * share,
+        )
+
+    def at(self, pose: NeedlePose) -> core.Needle:
+        """Return the core's needle with these looks."""
+        needle = core.Needle.from_buffer_copy(_defaults())
+        for name in _NUMBERS:
+            setattr(needle, name, getattr(self, name))
+        needle.diameter = self.diameter
+        parts = zip(core.NeedlePart, (self.shaft, self.tip, self.tail, self.shadow), strict=True)
+        needle.parts = sum(part for part, drawn in parts if drawn)
+        if self.apex is not None:
+            needle.curved, needle.apex[0], needle.apex[1] = 1, *self.apex
+        needle.entry[0], needle.entry[1] = pose.entry
+        needle.tip[0], needle.tip[1] = pose.tip
+        return needle
+
+
+_NUMBERS = tuple(
+    f.name for f in fields(NeedleEcho) if f.name not in ("gauge", "shaft", "tip", "tail", "shadow", "apex")
+)
+"""Looks that have the same name in the core."""
+
+
+@functools.cache
+def _one_pixel() -> NativePicture:
+    """Return a picture for echoes at points."""
+    return blank(RegularGrid((1, 1), (1.0, 1.0)), RegularGrid((2, 2), (1.0, 1.0)))
+
 
 def needle_echo(points: ArrayLike, pose: NeedlePose, echo: NeedleEcho) -> tuple[Floats, Floats]:
-    """Echo of the needle and what it lets through, at any points of the imaging plane.
-
-    The viewer's fragment shader evaluates the same formulas (`viewer/static/shaders.js`).
+    """Compute the needle's echo and what it lets through, at any points of the imaging plane.
 
     Parameters
     ----------
@@ -117,17 +205,20 @@ def needle_echo(points: ArrayLike, pose: NeedlePose, echo: NeedleEcho) -> tuple[
 
     Returns
     -------
-    brightness : ndarray, shape (n,)
-        0 (none) to 1 (white).
+    power : ndarray, shape (n,)
+        Of the echo relative to white; in dB, 0 is white and ``-echo.dynamic_range`` black.
     transmission : ndarray, shape (n,)
-        1 where nothing shades, less behind the shaft.
+        Share of the tissue's power that passes the needle: 1 where nothing shades.
     """
-    p = np.ascontiguousarray(points, dtype=np.float64)
-    brightness, transmission = np.zeros(len(p)), np.ones(len(p))
+    p = np.asarray(points, dtype=np.float64)
     if pose.depth < ZERO_LENGTH:
-        return brightness, transmission
-    _echo(p, pose.entry, pose.axis, pose.depth, _looks(echo), brightness, transmission)
-    return brightness, transmission
+        return np.zeros(len(p)), np.ones(len(p))
+    return _one_pixel().echo(echo.at(pose), p)
+
+
+def white_of(pixels: Pixels) -> float:
+    """Return the grey level of white: 255 for 8-bit pixels, else the largest value."""
+    return 255.0 if pixels.dtype == np.uint8 else float(pixels.max(initial=0))
 
 
 def draw_needle(
@@ -144,139 +235,37 @@ def draw_needle(
     echo : NeedleEcho, optional
         Its looks; the defaults of `NeedleEcho`.
     white : float, optional
-        Grey level of the strongest echo; 255 for 8-bit pixels, else the image's largest value (give it for
+        Grey level at which the display is white; 255 for 8-bit pixels, else the image's largest value (give it for
         the frames of a cine, whose largest values differ).
 
     Returns
     -------
     UltrasoundImage
-        New pixels of the same type on the same grid.
+        New pixels of the same type on the same grid; those that the needle does not touch are the same.
     """
-    looks = NeedleEcho() if echo is None else echo
-    pixels = image.pixels
+    pixels: Any = image.pixels
+    grid = image.grid
     if white is None:
-        white = 255.0 if pixels.dtype == np.uint8 else float(pixels.max())
-    rows, columns = _touched(image, pose, looks)
-    part = pixels[rows, columns].astype(np.float64)
-    x, y = image.grid.x[columns], image.grid.y[rows]
-    if part.size == 0 or white <= 0:
+        white = white_of(pixels)
+    if pose.depth < ZERO_LENGTH or pixels.size == 0 or white <= 0:
         return image
-    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    shape = (len(y), len(x)) + (1,) * (pixels.ndim - 2)
-    light, passed = (v.reshape(shape) for v in needle_echo(points, pose, looks))
-    part *= passed
-    part += light * np.maximum(white - part, 0.0)
+    colour = pixels if pixels.ndim == 2 else pixels[..., :3]
+    direct = pixels.dtype.type in DIRECT
+    source = colour if direct else (colour / white).astype(np.float32)
+    span = [max(n - 1, 1) * d for n, d in zip(grid.shape, grid.spacing, strict=True)]
+    still = NativePicture(  # undeformed, each pixel is the nearest one to itself
+        source, grid, RegularGrid((2, 2), (span[0], span[1]), grid.origin),
+        interpolation="nearest", border=0.0, inverse="exact", white=white if direct else 1.0,
+    )  # fmt: skip
+    drawn = still.draw((NeedleEcho() if echo is None else echo).at(pose))
+    changed = drawn != source
+    if pixels.ndim == 3 and pixels.shape[2] == 4:
+        changed &= pixels[..., 3:] > 0  # no needle where there is no tissue
     out = pixels.copy()
-    if np.issubdtype(pixels.dtype, np.integer):
-        part = np.rint(part)
-    out[rows, columns] = part.astype(pixels.dtype)
-    return UltrasoundImage(out, image.grid, image.source)
-
-
-def _looks(echo: NeedleEcho) -> tuple[float, ...]:
-    """Return the numbers that the compiled loop takes."""
-    apex = (0.0, 0.0) if echo.apex is None else echo.apex
-    traits = (echo.shaft, echo.tip, echo.reverberation, echo.shadow, echo.apex is not None)
-    return (
-        *(float(t) for t in traits),
-        *(float(c) for c in apex),
-        echo.diameter,
-        float(echo.resolution),
-        float(echo.brightness),
-        float(echo.fade_angle),
-        float(echo.floor),
-        float(echo.opacity),
-        float(echo.refill),
-    )
-
-
-@njit(cache=True, nogil=True)
-def _ends(s: Any, length: Any, width: Any) -> Any:
-    """Fall off beyond entry and tip."""
-    beyond = max(-s, s - length, 0.0)
-    return exp(-((beyond / width) ** 2))
-
-
-@njit(cache=True, nogil=True)
-def _step(x: Any) -> Any:
-    """Smooth rise from 0 at x = -1 to 1 at x = 1."""
-    t = min(max(0.5 * (x + 1.0), 0.0), 1.0)
-    return t * t * (3.0 - 2.0 * t)
-
-
-@njit(cache=True, nogil=True)
-def _light(s: Any, d: Any, facing: Any, drop: Any, length: Any, looks: Any) -> Any:
-    """Echo at (s along, d across) mm: the tube's two walls, their copies further down the beam, the tip."""
-    shaft, tip, reverberation = looks[0], looks[1], looks[2]
-    radius, width, fade, floor = looks[7] / 2, looks[8], looks[10], looks[11]
-    tilt = degrees(acos(min(facing, 1.0)))
-    mirror = exp(-((tilt / fade) ** 2))
-    strength = floor + (1 - floor) * mirror
-    light = 0.0
-    if shaft and abs(d) - radius < 6.5 * (width + radius):
-        u = length - s  # uneven brightness, fixed to the needle
-        grain = 0.88 + 0.12 * sin(2.1 * u) * sin(0.73 * u + 1.0)
-        walls = exp(-(((d + radius) / width) ** 2)) + FAR_WALL * exp(-(((d - radius) / width) ** 2))
-        between = 0.45 * exp(-((d / (radius + width)) ** 2))
-        light += strength * grain * min(walls + between, 1.0) * _ends(s, length, width)
-    if reverberation:
-        spacing = max(2 * radius, 3 * width)
-        for k in range(1, COPIES + 1):
-            shift = (k + 1) * spacing  # the far wall is the first of the series
-            off = (d + radius - shift * facing) / width
-            if off * off > NOTHING:  # a point lies near one copy or none: most of the work is not to be done
-                continue
-            copy = exp(-(off * off)) * _ends(s - shift * drop, length, width)
-            light += 0.8 * COPY_LOSS**k * strength * mirror * copy
-    if tip:
-        r2 = (s - length) ** 2 + d * d
-        light = max(light, (0.85 + 0.15 * mirror) * exp(-r2 / (width + 0.7 * radius) ** 2))
-    return light
-
-
-@njit(cache=True, nogil=True)
-def _echo(
-    points: Any, entry: Any, axis: Any, length: Any, looks: Any, brightness: Any, transmission: Any
-) -> None:
-    """Fill brightness and transmission point by point."""
-    reverberation, shadow, curved = looks[2], looks[3], looks[4]
-    diameter, width, refill = looks[7], looks[8], looks[13]
-    arrival = min(1.0, length / diameter)  # the echo grows with the first millimetre: the picture never jumps
-    reach = 3 * (width + diameter / 2)
-    deepest = reach + ((COPIES + 1) * max(diameter, 3 * width) if reverberation else 0.0)
-    beam_x, beam_y = 0.0, 1.0
-    for i in range(len(points)):
-        x, y = points[i, 0], points[i, 1]
-        if curved:
-            beam_x, beam_y = x - looks[5], y - looks[6]
-            size = max(hypot(beam_x, beam_y), ZERO_LENGTH)
-            beam_x, beam_y = beam_x / size, beam_y / size
-        across = beam_y * axis[0] - beam_x * axis[1]
-        side = -1.0 if across < 0 else 1.0  # distances across the shaft count away from the probe
-        facing = side * across  # sine of the angle between shaft and beam
-        drop = beam_x * axis[0] + beam_y * axis[1]
-        s = (x - entry[0]) * axis[0] + (y - entry[1]) * axis[1]
-        d = side * ((y - entry[1]) * axis[0] - (x - entry[0]) * axis[1])
-        if -reach < d < deepest and -deepest < s < length + deepest:
-            brightness[i] = arrival * looks[9] * min(_light(s, d, facing, drop, length, looks), 1.0)
-        if shadow and d > 0:
-            behind = d / max(facing, 1e-6)  # way back along the beam to the shaft
-            met = s - behind * drop
-            edge = width + 0.04 * behind  # the shadow's ends blur with distance
-            inside = _step(met / edge) * _step((length - met) / edge)
-            if inside > 0:
-                onset = min(d / diameter, 1.0) * exp(-behind / refill)
-                transmission[i] = 1.0 - arrival * looks[12] * facing * onset * inside
-
-
-def _touched(image: UltrasoundImage, pose: NeedlePose, echo: NeedleEcho) -> tuple[slice, slice]:
-    """Rows and columns outside which the needle changes nothing (the shadow runs on downwards)."""
-    everything = slice(0, image.grid.shape[1]), slice(0, image.grid.shape[0])
-    if echo.apex is not None:
-        return everything
-    (nx, ny), (dx, dy), (x0, y0) = image.grid.shape, image.grid.spacing, image.grid.origin
-    reach = echo.diameter + 6 * echo.resolution + 0.04 * image.grid.extent[3]
-    left = int(np.clip((min(pose.entry[0], pose.tip[0]) - reach - x0) // dx, 0, nx))
-    right = int(np.clip((max(pose.entry[0], pose.tip[0]) + reach - x0) // dx + 2, 0, nx))
-    top = int(np.clip((min(pose.entry[1], pose.tip[1]) - reach - y0) // dy, 0, ny))
-    return slice(top, ny), slice(left, right)
+    part = drawn[changed] if direct else drawn[changed].astype(np.float64) * white
+    if np.issubdtype(pixels.dtype, np.integer) and not direct:
+        limits = np.iinfo(pixels.dtype)
+        part = np.clip(np.rint(part), limits.min, limits.max)
+    into = out if out.ndim == 2 else out[..., :3]
+    into[changed] = part.astype(pixels.dtype)
+    return UltrasoundImage(out, grid, image.source)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from math import ceil, isfinite
 from time import perf_counter
@@ -10,13 +10,11 @@ from typing import Literal
 
 from echospline.errors import FoldingError, InputError
 from echospline.mechanics.protocol import State, TissueModel
-from echospline.picture.deformation import Deformation, Folds, InverseMap
-from echospline.picture.needle_echo import NeedleEcho, draw_needle
-from echospline.picture.warp import warp
+from echospline.picture.deformation import Folds
+from echospline.picture.drawing import Drawing, ImageFormer
+from echospline.picture.native import Border, Inverse
+from echospline.picture.needle_echo import NeedleEcho
 from echospline.scene import Floats, Insertion, NeedlePose, UltrasoundImage
-
-ImageFormer = Callable[[Deformation, InverseMap], UltrasoundImage]
-"""Forms the picture of deformed tissue; the default resamples the reference image."""
 
 
 @dataclass(frozen=True)
@@ -36,11 +34,11 @@ class Frame:
     image : UltrasoundImage
         The deformed picture.
     residual : float
-        Of the inverse map against the forward map, pixels.
+        Largest distance of a checked pixel from the forward map of its origin, pixels.
     folds : Folds or None
         Where the deformation folds.
     milliseconds : dict
-        Time spent per stage: interaction, spline, inverse map, warp, needle.
+        Time spent per stage: interaction, spline, picture (deformation, check, sampling and needle).
     """
 
     index: int
@@ -73,8 +71,9 @@ def simulate(
     *,
     fps: float = 30.0,
     longest_step: float = 1 / 30,
-    border: float | Literal["transparent"] = 0.0,
+    border: Border = 0.0,
     folding: Literal["flag", "refuse"] = "flag",
+    inverse: Inverse = "auto",
     needle: NeedleEcho | None = None,
     form_image: ImageFormer | None = None,
 ) -> Iterator[Frame]:
@@ -96,10 +95,13 @@ def simulate(
         Where no tissue comes to lie.
     folding : {"flag", "refuse"}
         Whether a folded picture is flagged in ``Frame.folds`` or ends the run.
+    inverse : {"auto", "exact"}
+        How origins of pixels are found: interpolated over 4 x 4 pixels where that is good to 0.1 pixel, or each in its cell of
+        the mesh (see `Drawing`). A ``form_image`` gets the exact inverse map.
     needle : NeedleEcho, optional
         Draws the needle's echo into the picture.
     form_image : callable, optional
-        Forms the picture in place of `warp`.
+        Forms the picture of deformed tissue; the default resamples the image.
 
     Yields
     ------
@@ -109,7 +111,7 @@ def simulate(
     Raises
     ------
     InputError
-        If fps or longest_step is not positive.
+        If fps or longest_step is not positive, or an option is unknown.
     FoldingError
         If the picture folds and ``folding="refuse"``.
     """
@@ -118,6 +120,9 @@ def simulate(
         raise InputError(f"longest_step must be a positive number of seconds; got {longest_step}")
     steps = max(1, ceil(1.0 / fps / longest_step - 1e-9))
     start = float(insertion.times[0])
+    drawing = Drawing(
+        image, model.grid, border=border, inverse=inverse, folding=folding, form_image=form_image
+    )
     state = model.rest()
     for index in range(count):
         clock = _Stopwatch()
@@ -128,20 +133,12 @@ def simulate(
         clock.stage("interaction")
         u = model.displacement(state)
         clock.stage("spline")
-        deformation = Deformation(model.grid, u)
-        folds = deformation.folds
-        if folds and folding == "refuse":
-            raise FoldingError(f"at {index / fps:.2f} s {folds}: push less far, or let folding be flagged")
-        inverse = deformation.inverse(image.grid)
-        clock.stage("inverse map")
-        picture = (
-            warp(image, inverse, border=border) if form_image is None else form_image(deformation, inverse)
-        )
-        clock.stage("warp")
-        if needle is not None:
-            picture = draw_needle(picture, pose, needle)
-            clock.stage("needle")
-        yield Frame(index, index / fps, pose, u, picture, inverse.residual, folds, clock.milliseconds)
+        try:
+            drawn = drawing.draw(u, pose, needle)
+        except FoldingError as error:
+            raise FoldingError(f"at {index / fps:.2f} s {error}") from None
+        clock.stage("picture")
+        yield Frame(index, index / fps, pose, u, drawn.image, drawn.residual, drawn.folds, clock.milliseconds)
 
 
 class _Stopwatch:

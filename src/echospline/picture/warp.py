@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 
 from echospline.errors import FoldingError, InputError
-from echospline.picture.deformation import Deformation, InverseMap
+from echospline.picture.deformation import Deformation, Folds, InverseMap
+from echospline.picture.native import LARGEST, Border, NativePicture, drawable
 from echospline.scene import Pixels, UltrasoundImage
 
 Interpolation = Literal["linear", "nearest", "cubic"]
@@ -21,11 +22,15 @@ def warp(
     image: UltrasoundImage,
     deformation: Deformation | InverseMap,
     *,
-    border: float | Literal["transparent"] = 0.0,
+    border: Border = 0.0,
     interpolation: Interpolation = "linear",
     folding: Literal["flag", "refuse"] = "flag",
 ) -> UltrasoundImage:
     """Deform an image.
+
+    A deformation of uint8, uint16, int16 or float32 pixels, grey or RGB, linear or nearest, is drawn by the native core.
+    Everything else (other types, RGBA, cubic, an inverse map) goes through the inverse map and ``cv2.remap``, which may round
+    positions to 1/32 of a pixel.
 
     Parameters
     ----------
@@ -56,8 +61,17 @@ def warp(
     if folding not in ("flag", "refuse"):
         raise InputError(f'folding is "flag" or "refuse"; got {folding!r}')
     if isinstance(deformation, Deformation):
-        if folding == "refuse" and deformation.folds:
-            raise FoldingError(f"{deformation.folds}: push less far, or allow it with folding flagged")
+        if interpolation != "cubic" and in_core(image, border):
+            picture = NativePicture(
+                image.pixels, image.grid, deformation.grid,
+                interpolation=interpolation, border=border, inverse="exact", white=0.0,
+            )  # fmt: skip
+            picture.deform(deformation.displacement)
+            if folding == "refuse":
+                _refuse(Folds.of(picture.report()))
+            return UltrasoundImage(picture.draw(None), image.grid, image.source)
+        if folding == "refuse":
+            _refuse(deformation.folds)
         inverse = deformation.inverse(image.grid)
     else:
         inverse = deformation
@@ -68,6 +82,16 @@ def warp(
     if border == "transparent":
         pixels = _with_alpha(pixels, inverse)
     return UltrasoundImage(pixels, image.grid, image.source)
+
+
+def in_core(image: UltrasoundImage, border: Border) -> bool:
+    """Return whether the native core can draw an image with such a border."""
+    return drawable(image.pixels) and (border == "transparent" or abs(border) <= LARGEST)
+
+
+def _refuse(folds: Folds | None) -> None:
+    if folds:
+        raise FoldingError(f"{folds}: push less far, or allow it with folding flagged")
 
 
 def _resample(pixels: Pixels, inverse: InverseMap, fill: float, flag: int) -> Pixels:

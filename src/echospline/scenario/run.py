@@ -130,6 +130,7 @@ def run(
             longest_step=output.longest_step,
             border=output.border,
             folding=output.folding,
+            inverse=output.inverse,
             needle=scenario.needle_echo(),
             form_image=form_image,
         ):

@@ -62,7 +62,7 @@ class Scenario(Section):
     image: ImageSection = ImageSection()
     tissue: TissueSection = TissueSection()
     mesh: MeshSection = MeshSection()
-    needle: NeedleSection = NeedleSection()
+    needle: NeedleSection = Field(default_factory=NeedleSection)
     model: ModelSection = ModelSection()
     output: OutputSection = OutputSection()
     probe: ProbeSection = ProbeSection()
@@ -124,7 +124,7 @@ class Scenario(Section):
 
     def needle_echo(self) -> NeedleEcho | None:
         """Return the needle's looks, or None where it is not drawn."""
-        return NeedleEcho(gauge=self.needle.gauge) if self.output.needle else None
+        return self.needle.echo.looks(self.needle.gauge) if self.output.needle else None
 
     def make_tissue(self, folder: Path, mesh: RegularGrid) -> Tissue:
         """Build the tissue with its regions; a labels image is laid over the whole mesh."""

@@ -6,11 +6,12 @@ another unit is refused.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from echospline.picture import OUTER_DIAMETER
+from echospline.errors import InputError
+from echospline.picture import OUTER_DIAMETER, NeedleEcho
 
 
 def _in_unit(unit: str) -> BeforeValidator:
@@ -112,6 +113,57 @@ class MeshSection(Section):
     clamped_points: list[Point] = Field(default=[], description="further points held fast, mm")
 
 
+def _look(name: str, description: str) -> Any:
+    """Return a key whose default and range the core has."""
+    return Field(default_factory=lambda: getattr(NeedleEcho(), name), description=description)
+
+
+class EchoSection(Section):
+    """The needle's looks; levels are dB of power relative to white."""
+
+    shaft: bool = Field(True, description="draw the line of the near wall")
+    tip: bool = Field(True, description="draw tip and heel of the bevel")
+    tail: bool = Field(True, description="draw the ring-down below a shaft across the beam")
+    shadow: bool = Field(True, description="draw the shadow")
+    apex: Point | None = Field(
+        None, description="where the beams of a curved array cross, mm; a linear array where not given"
+    )
+    lateral: Millimetres = _look("lateral", "resolution across the beam: sigma, mm")
+    axial: Millimetres = _look("axial", "resolution along the beam: sigma, mm")
+    elevation: Millimetres = _look("elevation", "thickness of the slice at its focus: sigma, mm")
+    elevation_depth: Millimetres = _look("elevation_depth", "depth of that focus, mm")
+    element_height: Millimetres = _look("element_height", "height of the array across the plane, mm")
+    f_number: float = _look("f_number", "depth over aperture: penumbra of the shadow")
+    dynamic_range: float = _look("dynamic_range", "of the display, dB")
+    specular: float = _look("specular", "level of a shaft at right angles to the beam, dB")
+    lobe: Degrees = _look("lobe", "tilt at which that has fallen by 4.3 dB, degrees")
+    lobe_elevation: Degrees = _look("lobe_elevation", "the same out of the plane, degrees")
+    steering: Degrees = _look(
+        "steering", "beams are compounded at 0 and plus and minus this, degrees; 0: none"
+    )
+    roughness: float = _look("roughness", "level of the grain at any tilt, dB")
+    rolloff: float = _look("rolloff", "its loss from 50 to 90 degrees of tilt, dB")
+    wobble: float = _look("wobble", "standard deviation of slow changes along the shaft, dB")
+    patches: float = _look("patches", "standard deviation of the grain's level in patches of 1.5 mm, dB")
+    bevel: float = _look("bevel", "level of the tip, dB")
+    ring_down: float = _look("ring_down", "first level of the tail relative to the specular echo, dB")
+    ring_down_loss: float = _look("ring_down_loss", "loss along the tail, dB/mm")
+    opacity: float = _look("opacity", "share of a blocked ray that is lost, 0 to 1")
+    seed: int = _look("seed", "of the grain, which is fixed to the needle")
+
+    @model_validator(mode="after")
+    def _in_range(self) -> Self:
+        try:
+            self.looks(min(OUTER_DIAMETER))
+        except InputError as error:
+            raise ValueError(str(error)) from None
+        return self
+
+    def looks(self, gauge: int) -> NeedleEcho:
+        """Return the looks of a needle of a gauge."""
+        return NeedleEcho(gauge=gauge, **self.model_dump())
+
+
 class NeedleSection(Section):
     """The needle and its path."""
 
@@ -134,6 +186,7 @@ class NeedleSection(Section):
     gauge: int = Field(
         18, ge=min(OUTER_DIAMETER), le=max(OUTER_DIAMETER), description="gauge, sets the diameter"
     )
+    echo: EchoSection = Field(default_factory=EchoSection)
 
 
 class LandmarkSection(Section):
@@ -211,6 +264,9 @@ class OutputSection(Section):
         0.0, description="value where no tissue comes to lie"
     )
     folding: Literal["flag", "refuse"] = Field("flag", description="what happens when the picture folds")
+    inverse: Literal["auto", "exact"] = Field(
+        "auto", description="origins of pixels: interpolated where good to 0.1 pixel, or each traced exactly"
+    )
     image_model: Literal["warp", "rescatter"] = Field(
         "warp",
         description="warp the picture, or move scatterers as bright as it and image them anew ([probe])",

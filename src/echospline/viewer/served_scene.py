@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from math import cos, radians, sin
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,15 @@ from echospline.viewer.exercise import Exercise, check_exercises
 
 LARGEST_SIDE = 4096
 """Pixels; every WebGL2 browser accepts textures of 2048, and nearly all accept this."""
+PAGE_LOOK = {
+    "brightness": 0.9,  # of the strongest echo, share of white
+    "resolution": 0.3,  # half width of a thin line's echo to 1/e, mm
+    "fade_angle": 40.0,  # tilt at which the mirror echo has fallen to 1/e, degrees
+    "floor": 0.3,  # echo that is left at any angle, share of the strongest
+    "opacity": 0.45,  # of the shadow
+    "refill": 25.0,  # way behind the shaft over which the shadow fades to 1/e, mm
+}
+"""Numbers of the page's own shader, which draws a simpler needle than `draw_needle`: walls, copies of them, shadow."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +99,7 @@ class Scene:
             self.image.grid.spacing,
             self.image.grid.origin,
         )
-        echo = asdict(self.echo) | {"diameter": self.echo.diameter}
+        echo = PAGE_LOOK | {"diameter": self.echo.diameter, "apex": self.echo.apex}
         return {
             "title": self.title,
             "image": {"columns": columns, "rows": rows, "spacing": spacing, "origin": origin},

@@ -44,7 +44,7 @@ void main() {
   gl_Position = vec4(vWorld * toClip.xy + toClip.zw, 0.0, 1.0);
 }`;
 
-// The needle's formulas are those of needle_echo.py, line by line.
+// The needle is simpler than the one that the core draws; its numbers are PAGE_LOOK in served_scene.py.
 export const FRAGMENT = `#version 300 es
 precision highp float;
 in vec2 vRest;
