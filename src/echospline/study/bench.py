@@ -15,7 +15,7 @@ from echospline.errors import InputError
 from echospline.mechanics import Elastic, Kernel, ThinPlate, TPSModel, TPSParameters
 from echospline.mechanics.native import NativeStep
 from echospline.mechanics.tps import State
-from echospline.picture import Deformation, NeedleEcho, draw_needle, warp
+from echospline.picture import Deformation, Drawing, NeedleEcho
 from echospline.scene import Floats, NeedlePose, RegularGrid, UltrasoundImage
 
 MESHES = {1200: (40, 30), 4524: (78, 58)}
@@ -204,12 +204,12 @@ Draw = Callable[[Floats, NeedlePose], object]
 def drawings(model: TPSModel, image: UltrasoundImage) -> dict[str, Draw]:
     """Return the ways to draw a frame, by the names of their rows."""
     echo = NeedleEcho()
-
-    def exact(displacement: Floats, pose: NeedlePose) -> UltrasoundImage:
-        warped = warp(image, Deformation(model.grid, displacement).inverse(image.grid))
-        return draw_needle(warped, pose, echo)
-
-    return {"frame": exact}
+    pull = Drawing(image, model.grid, inverse="auto")
+    exact = Drawing(image, model.grid, inverse="exact")
+    return {
+        "frame, pull": lambda displacement, pose: pull.draw(displacement, pose, echo).image,
+        "frame, exact": lambda displacement, pose: exact.draw(displacement, pose, echo).image,
+    }
 
 
 def _late(values: NDArray[Any]) -> NDArray[Any]:
