@@ -459,7 +459,9 @@ def test_the_needle_is_drawn_where_it_is(live, apex):
         assert got[away < 0.5].mean() > 115, f"at {angle} degrees"
         at_tip = np.hypot(columns - pose.tip[0], rows - pose.tip[1]) < 0.5
         assert got[at_tip].max() > 180
-        above = (away > 3) & (rows < 1)
+        inside = np.zeros(got.shape, bool)
+        inside[1:-1, 1:-1] = True  # the outermost pixels of the canvas are half background
+        above = (away > 3) & (rows < 1) & inside
         assert np.abs(got[above] - 100).max() <= 2
 
 

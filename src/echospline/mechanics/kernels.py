@@ -282,7 +282,7 @@ class Elastic:
             motions[a, :, a] = 1.0
         for j, (a, b) in enumerate(TURNS[D], start=D):
             motions[a, :, j], motions[b, :, j] = -points[:, b], points[:, a]
-        return motions.reshape(D * n, -1)
+        return motions.reshape(D * n, motions.shape[2])
 
     def polynomial_gradient(self, points: Floats) -> Floats:
         """Return the derivatives of the rigid motions, shape (D, D n, p)."""
@@ -290,4 +290,4 @@ class Elastic:
         gradient = np.zeros((D, D, n, D + len(TURNS[D])))
         for j, (a, b) in enumerate(TURNS[D], start=D):
             gradient[b, a, :, j], gradient[a, b, :, j] = -1.0, 1.0
-        return gradient.reshape(D, D * n, -1)
+        return gradient.reshape(D, D * n, gradient.shape[3])
