@@ -26,7 +26,7 @@ from echospline.scene import Floats, as_points
 class AnchoredKernel:
     """G for one set of anchors and one set of points to evaluate it at.
 
-    Rows stand for sources and columns for points, because rows are what a step reads. With two components (c = 2) a
+    Rows stand for sources and columns for points. With two components (c = 2) a
     row holds all x, then all y; sources are interleaved (x, y of the first, x, y of the second, ...).
 
     Parameters
@@ -39,10 +39,6 @@ class AnchoredKernel:
         [U_xB P_x]', what every row needs of the points.
     factors
         LU of L_B.
-    sources : ndarray, shape (K, 2)
-        Where contacts may stand, conditioned.
-    felt, held : ndarray, shape (K c, b c + p)
-        [U_yB P_y] of the sources, and L_B^-1 of it.
     centre, scale
         mm.
     """
@@ -52,9 +48,6 @@ class AnchoredKernel:
     points: Floats
     table: Floats
     factors: Any
-    sources: Floats
-    felt: Floats
-    held: Floats
     centre: Floats
     scale: float
 
@@ -65,8 +58,6 @@ class AnchoredKernel:
         anchors: ArrayLike,
         points: Floats,
         stiffness: ArrayLike | None = None,
-        *,
-        sources: Floats | None = None,
     ) -> AnchoredKernel:
         """Assemble and factor L_B.
 
@@ -80,30 +71,28 @@ class AnchoredKernel:
             Where rows are evaluated (the mesh nodes), mm.
         stiffness : array_like, shape (b,), optional
             As in `spline.factor`; infinite holds exactly.
-        sources : ndarray, shape (K, 2), optional
-            Where contacts may stand, mm.
 
         Raises
         ------
         InputError
             If the anchors alone do not hold the tissue (they lie on one line).
         """
-        held = as_points(anchors, "anchors")
+        fixed = as_points(anchors, "anchors")
         c = kernel.components
-        centre = 0.5 * (held.min(axis=0) + held.max(axis=0))
-        scale = float(np.ptp(held, axis=0).max()) / 2 or 1.0
-        B, x = (held - centre) / scale, (points - centre) / scale
+        centre = 0.5 * (fixed.min(axis=0) + fixed.max(axis=0))
+        scale = float(np.ptp(fixed, axis=0).max()) / 2 or 1.0
+        B, x = (fixed - centre) / scale, (points - centre) / scale
         conditioned = kernel.scaled(scale)
         R = conditioned.polynomial(B)
         singular = np.linalg.svd(R, compute_uv=False)
         if len(singular) < R.shape[1] or singular[-1] < 1e-9 * singular[0]:
             raise InputError(
-                f"the {len(held)} anchors do not hold the tissue alone; clamp points off one line, "
+                f"the {len(fixed)} anchors do not hold the tissue alone; clamp points off one line, "
                 'or use the solver "refit"'
             )
         K = conditioned.matrix(B, B)
         if stiffness is not None:
-            k = np.broadcast_to(np.asarray(stiffness, dtype=np.float64), (len(held),))
+            k = np.broadcast_to(np.asarray(stiffness, dtype=np.float64), (len(fixed),))
             if not (k > 0).all():
                 raise InputError(f"every stiffness must be positive (or infinite); got {k.min()}")
             K = K + np.diag(np.tile(compliance(kernel, k) / scale**kernel.length_power, c))
@@ -111,10 +100,7 @@ class AnchoredKernel:
         L = np.block([[K, R], [R.T, np.zeros((p, p))]])
         table = np.ascontiguousarray(np.hstack([conditioned.matrix(x, B), conditioned.polynomial(x)]).T)
         factors = lu_factor(L, check_finite=False)
-        y = np.ascontiguousarray((np.empty((0, 2)) if sources is None else sources - centre) / scale)
-        felt = _felt(conditioned, y, B)
-        held = np.ascontiguousarray(lu_solve(factors, felt.T, check_finite=False).T)
-        return cls(conditioned, B, x, table, factors, y, felt, held, centre, scale)
+        return cls(conditioned, B, x, table, factors, centre, scale)
 
     @property
     def components(self) -> int:
