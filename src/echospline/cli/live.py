@@ -90,7 +90,7 @@ def live(
     scene = scene_of(scenario, image, folder)
     settings = Settings(host, port, rate, clients, nodes=nodes)
     kept = Sessions(sessions or default_sessions())
-    scene.models(scene.names[0][0])  # refuses an invalid scenario, and compiles, before a page waits for it
+    scene.models(scene.names[0][0])  # refuses an invalid scenario before a page waits for it
     app = build_app(scene, kept, settings, opener_for(scenario))
     console = Console(stderr=True)
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
