@@ -15,7 +15,7 @@ from echospline.errors import InputError
 from echospline.mechanics import Elastic, Kernel, ThinPlate, TPSModel, TPSParameters
 from echospline.mechanics.native import NativeStep
 from echospline.mechanics.tps import State
-from echospline.picture import Deformation, Drawing, NeedleEcho
+from echospline.picture import Deformation, Drawing, InverseMap, NeedleEcho
 from echospline.scene import Floats, NeedlePose, RegularGrid, UltrasoundImage
 
 MESHES = {1200: (40, 30), 4524: (78, 58)}
@@ -173,28 +173,37 @@ def _steps(name: str, shape: tuple[int, int], kernel: Kernel) -> list[Row]:
 
 
 def _frames(shape: tuple[int, int]) -> list[Row]:
-    """Time whole frames at 60 Hz, from pose to picture, and cv2.remap between them."""
+    """Time whole frames at 60 Hz, from pose to picture, and cv2.remap after them."""
     model, period = scene(shape), PERIODS["60 Hz"]
     grid = RegularGrid((PIXELS, PIXELS), (40.0 / (PIXELS - 1), 30.0 / (PIXELS - 1)))
     noise = np.random.default_rng(0).integers(0, 255, (PIXELS, PIXELS), dtype=np.uint8)
     image = UltrasoundImage(noise, grid)
     rows = []
     for name, draw in drawings(model, image).items():
-        state, frames, remaps = model.rest(), [], []
+        state, frames = model.rest(), []
         for pose in path(period):
             begin = perf_counter()
             state = model.advance(state, pose, period)
             draw(model.displacement(state), pose)
             frames.append(perf_counter() - begin)
-            found = Deformation(model.grid, model.displacement(state)).inverse(grid)
-            begin = perf_counter()
-            cv2.remap(noise, found.x, found.y, cv2.INTER_LINEAR)
-            remaps.append(perf_counter() - begin)
+        remaps = _remaps(noise, Deformation(model.grid, model.displacement(state)).inverse(grid))
         limit = float(np.median(remaps))
         rows.append(
             _row(name, shape, moving(model, state), _late(np.array(frames)), limit, native(model).level)
         )
     return rows
+
+
+def _remaps(pixels: NDArray[Any], found: InverseMap, repeats: int = 100) -> list[float]:
+    """Time cv2.remap of a deformed picture, in one thread."""
+    threads, times = cv2.getNumThreads(), []
+    cv2.setNumThreads(1)
+    for _ in range(repeats):
+        begin = perf_counter()
+        cv2.remap(pixels, found.x, found.y, cv2.INTER_LINEAR)
+        times.append(perf_counter() - begin)
+    cv2.setNumThreads(threads)
+    return times
 
 
 Draw = Callable[[Floats, NeedlePose], object]
