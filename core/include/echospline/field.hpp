@@ -67,7 +67,7 @@ struct Planes {
 
 /// What a scene's field needs and never changes: points, which of them are sources, and in the plane [U_xB P_x] at them.
 template <int D, class Kernel, class Real>
-class FieldScene : public SceneField<D> {
+class FieldScene final : public SceneField<D> {
  public:
   static constexpr int c = Kernel::components;
   static constexpr int64_t block = Points<D, Real>::block;
@@ -136,7 +136,7 @@ class FieldScene : public SceneField<D> {
 };
 
 template <int D, class Kernel, class Real>
-class FieldOf : public SessionField<D> {
+class FieldOf final : public SessionField<D> {
  public:
   static constexpr int c = Kernel::components;
   static constexpr bool keeps_columns = D == 2;

@@ -46,6 +46,10 @@ class Mesh(Protocol):
         ...
 
 
+MOST_ANCHORS = 1500
+"""Anchors of a scene at most: their system is a full matrix, and 1500 take seconds to factor."""
+
+
 @dataclass(frozen=True)
 class Clamps:
     """What is held fast: whole edges of the mesh (faces in space), and single points.
@@ -103,6 +107,14 @@ class Clamps:
         In a face they form a lattice, ``spacing`` mm apart along each direction.
         """
         low, high = _extent(self.grid)
+        gaps = np.maximum(1.0, np.ceil((high - low) / spacing - 1e-9)) + 1.0
+        count = len(self.points) + sum(np.prod(np.delete(gaps, SIDES[edge][0])) for edge in self.edges)
+        if count > MOST_ANCHORS:
+            size = " x ".join(f"{width:g}" for width in high - low)
+            raise InputError(
+                f"anchors {spacing:g} mm apart along what is clamped may be {MOST_ANCHORS} at most; a mesh of {size} mm needs "
+                f"{count:.0f}: check the image's spacing in mm, or raise anchor_spacing"
+            )
         every = []
         for axis, side in (SIDES[edge] for edge in self.edges):
             lines = [_line(a, b, spacing) for a, b in zip(low, high, strict=True)]

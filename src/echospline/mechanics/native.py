@@ -7,7 +7,6 @@ on from that one is fast, and from any other one exact after its bytes have been
 from __future__ import annotations
 
 import ctypes
-import itertools
 import threading
 import weakref
 from collections.abc import Iterable, Sequence
@@ -19,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echospline import _native as core
+from echospline.errors import InputError
 from echospline.mechanics.kernels import Elastic, Kernel
 from echospline.mechanics.landmarks import Clamps
 from echospline.mechanics.parameters import TPSParameters
@@ -30,8 +30,6 @@ Precision = Literal["single", "double"]
 FINE = 20_000
 """Nodes above which the core evaluates a mesh from a coarse one, and the displacement of a state only when it is asked for."""
 
-_numbers = itertools.count(1)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NativeState:
@@ -39,17 +37,15 @@ class NativeState:
 
     Parameters
     ----------
-    number : int
-        Different for every state of the process.
     saved : bytes
         The state as the core saves it.
     mesh : ndarray, shape (n, 2), or None
-        Displacement of the mesh nodes, mm; None for a fine mesh, whose displacement is computed when it is asked for.
+        Displacement of the mesh nodes, mm, read-only; None for a fine mesh, whose displacement is computed when it is asked
+        for.
     held_back : int
         Steps since rest in which the landmarks were slowed down so that the picture does not jump.
     """
 
-    number: int
     saved: bytes
     mesh: Floats | None
     held_back: int
@@ -130,6 +126,7 @@ class NativeStep:
         self._core = core.library()
         self._lock = threading.Lock()
         self._size, self._fine = grid.size, grid.size > FINE
+        self._current: NativeState | None = None
         options = _options(grid, clamps, parameters, kernel, precision)
         points = np.ascontiguousarray(clamps.points, dtype=np.float64)
         options.clamped_points, options.clamped_point_count = points.ctypes.data, len(points)
@@ -171,13 +168,17 @@ class NativeStep:
             self._set(pose, dt)
             status = self._core.echospline_advance(self._tissue, self._at_pose)
             if status != core.Status.OK:
-                self._current = 0
+                self._current = None
                 self._check(status)
             return self._present()
 
     def displacement(self, state: NativeState) -> Floats:
         """Displacement of the mesh nodes, shape (n, 2), mm."""
         if state.mesh is not None:
+            if len(state.mesh) != self._size:
+                raise InputError(
+                    f"this state has a mesh of {len(state.mesh)} nodes; the model has {self._size}: use a state of this model"
+                )
             return state.mesh
         with self._lock:
             self._go_to(state)
@@ -229,7 +230,7 @@ class NativeStep:
         advance, displacement = self._core.echospline_advance, self._core.echospline_displacement_single
         tissue, at_pose, at_mesh, numbers = self._tissue, self._at_pose, mesh.ctypes.data, mesh.size
         with self._lock:
-            self._current = 0
+            self._current = None
             self._check(self._core.echospline_tissue_reset(tissue))
             self._ask_statistics()
             changes[0] = self._statistics.joined + self._statistics.left
@@ -250,18 +251,21 @@ class NativeStep:
         p.speed, p.dt = pose.speed, dt
 
     def _go_to(self, state: NativeState) -> None:
-        if state.number != self._current:
+        if state is not self._current:  # the very object: an equal number might come from another process
+            self._current = None
             self._check(self._core.echospline_state_load(self._tissue, state.saved, len(state.saved)))
-            self._current = state.number
+            self._current = state
 
     def _present(self) -> NativeState:
         """State in which the core's tissue is now."""
         saved = ctypes.create_string_buffer(self._core.echospline_state_size(self._tissue))
         self._check(self._core.echospline_state_save(self._tissue, saved, len(saved)))
         self._ask_statistics()
-        self._current = next(_numbers)
         mesh = None if self._fine else self._mesh()
-        return NativeState(self._current, saved.raw, mesh, self._statistics.held_back)
+        if mesh is not None:
+            mesh.setflags(write=False)
+        self._current = NativeState(saved.raw, mesh, self._statistics.held_back)
+        return self._current
 
     def _mesh(self) -> Floats:
         mesh = np.empty((self._size, 2))

@@ -151,6 +151,45 @@ def factor(kernel: Kernel, landmarks: ArrayLike, stiffness: ArrayLike | None = N
         If landmarks are too few, on one line (in space: in one plane), coincident or not finite, or a stiffness is not
         positive.
     """
+    points, x, centre, scale = condition(kernel, landmarks)
+    m, c = len(points), kernel.components
+    conditioned = kernel.scaled(scale)
+    K = conditioned.matrix(x, x)
+    R = conditioned.polynomial(x)
+    if stiffness is not None:
+        k = np.broadcast_to(np.asarray(stiffness, dtype=np.float64), (m,))
+        if not (k > 0).all():
+            raise InputError(f"every stiffness must be positive (or infinite); got {k.min()}")
+        K = K + np.diag(np.tile(compliance(kernel, k) / scale**kernel.length_power, c))
+    p = R.shape[1]
+    L = np.block([[K, R], [R.T, np.zeros((p, p))]])
+    return FactoredSpline(conditioned, points, centre, scale, L, lu_factor(L, check_finite=False))
+
+
+def condition(kernel: Kernel, landmarks: ArrayLike) -> tuple[Floats, Floats, Floats, float]:
+    """Check landmarks, and shift and scale them for a solve.
+
+    Parameters
+    ----------
+    kernel : Kernel
+        `ThinPlate` or `Elastic`.
+    landmarks : array_like, shape (m, D)
+        mm.
+
+    Returns
+    -------
+    points, x : ndarray, shape (m, D)
+        The landmarks in mm, and as (points - centre) / scale.
+    centre : ndarray, shape (D,)
+        mm.
+    scale : float
+        mm.
+
+    Raises
+    ------
+    InputError
+        If landmarks are too few, on one line (in space: in one plane), coincident or not finite.
+    """
     D, c = kernel.dimension, kernel.components
     points = as_points(landmarks, "landmarks", D)
     m = len(points)
@@ -163,17 +202,7 @@ def factor(kernel: Kernel, landmarks: ArrayLike, stiffness: ArrayLike | None = N
     scale = float(np.ptp(points, axis=0).max()) / 2 or 1.0
     x = (points - centre) / scale
     _refuse_degenerate(kernel, points, x)
-    conditioned = kernel.scaled(scale)
-    K = conditioned.matrix(x, x)
-    R = conditioned.polynomial(x)
-    if stiffness is not None:
-        k = np.broadcast_to(np.asarray(stiffness, dtype=np.float64), (m,))
-        if not (k > 0).all():
-            raise InputError(f"every stiffness must be positive (or infinite); got {k.min()}")
-        K = K + np.diag(np.tile(compliance(kernel, k) / scale**kernel.length_power, c))
-    p = R.shape[1]
-    L = np.block([[K, R], [R.T, np.zeros((p, p))]])
-    return FactoredSpline(conditioned, points, centre, scale, L, lu_factor(L, check_finite=False))
+    return points, x, centre, scale
 
 
 def compliance(kernel: Kernel, stiffness: Floats) -> Floats:

@@ -20,7 +20,7 @@ from echospline.mechanics.landmarks import Clamps, contact_lattice, join_gap
 from echospline.mechanics.native import NativeState, NativeStep, Precision
 from echospline.mechanics.parameters import TPSParameters
 from echospline.mechanics.reference import Reference, TPSState
-from echospline.mechanics.spline import Spline, factor
+from echospline.mechanics.spline import Spline, condition
 from echospline.scene import Floats, NeedlePose, RegularGrid
 
 Solver = Literal["response", "refit"]
@@ -81,7 +81,7 @@ class TPSModel:
             raise InputError("a mesh in the plane takes a kernel of the plane; got one of dimension 3")
         self.clamps = Clamps.of(grid, clamped, clamped_points)
         self.anchors = self.clamps.anchors(self.parameters.anchor_spacing)
-        factor(self.kernel, self.anchors)  # refuses anchors that hold nothing, before any step is made
+        condition(self.kernel, self.anchors)  # refuses anchors that hold nothing, before any step is made
         self.lattice = contact_lattice(self.clamps, self.parameters.contact_spacing)
         self.gap = join_gap(grid, self.lattice)
         self.stiffness: Floats | None = None
