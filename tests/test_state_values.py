@@ -47,6 +47,17 @@ def test_a_state_of_another_mesh_is_refused():
         other.displacement(TPSModel(GRID).rest())
 
 
+@pytest.mark.parametrize("precision", ["single", "double"])
+def test_a_model_is_pickled_as_what_it_was_made_of(precision):
+    firm = np.random.default_rng(1).uniform(0.5, 5.0, GRID.size)
+    model = TPSModel(GRID, ("left", "bottom"), stiffness=firm, precision=precision)
+    twin = pickle.loads(pickle.dumps(model))
+    assert twin is not model
+    a, b = model.displacement(pushed(model, 12.0, 10)), twin.displacement(pushed(twin, 12.0, 10))
+    assert np.abs(a).max() > 0.1
+    assert np.array_equal(a, b)
+
+
 def test_a_mesh_of_many_metres_is_refused_at_once():
     with pytest.raises(InputError, match="check the image's spacing"):
         TPSModel(RegularGrid((40, 30), (1e4, 1e4)))

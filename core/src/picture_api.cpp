@@ -236,8 +236,8 @@ void echospline_needle_defaults(echospline_needle* needle) {
   needle->wobble = 2.5;
   needle->patches = 5;
   needle->bevel = -3;
-  needle->ring_down = -27;
-  needle->ring_down_loss = 5;
+  needle->ring_down = -36;
+  needle->ring_down_loss = 7;
   needle->opacity = 0.75;
 }
 

@@ -8,6 +8,7 @@ each step; `mechanics.native` reaches the same numbers in the native core.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import partial
 from math import isfinite
 from typing import Literal, get_args
 
@@ -100,11 +101,23 @@ class TPSModel:
             self.gap,
             self.stiffness,
         )
+        self.solver, self.precision = solver, precision
         self.native: NativeStep | None = None
         if solver == "response":
             self.native = NativeStep(
                 grid, self.clamps, self.parameters, self.kernel, self.stiffness, precision
             )
+
+    def __reduce__(self) -> tuple[partial[TPSModel], tuple[object, ...]]:
+        """Pickle what the model was made of; a copy has a workspace of its own."""
+        made = partial(
+            TPSModel,
+            clamped_points=self.clamps.points,
+            stiffness=self.stiffness,
+            solver=self.solver,
+            precision=self.precision,
+        )
+        return made, (self.grid, self.clamps.edges, self.parameters, self.kernel)
 
     def rest(self) -> State:
         """State of tissue that no needle has touched."""
