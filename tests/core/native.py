@@ -1,4 +1,4 @@
-"""The compiled core for tests: finds the library, and declares its picture interface for ctypes."""
+"""Pictures of the compiled core for tests and benchmarks, through the package's binding."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from echospline import _native
 
 HERE = Path(__file__).resolve().parents[2]
 OK, NULL_POINTER, WRONG_SIZE, WRONG_VALUE, FAILED_HANDLE = 0, 1, 2, 3, 8
@@ -28,109 +30,14 @@ def library_path() -> Path | None:
     return found[0] if found else None
 
 
-def struct(name: str, **fields: Any) -> type[c.Structure]:
-    """Declare a C struct."""
-    return type(name, (c.Structure,), {"_fields_": list(fields.items())})
-
-
-PictureOptions: Any = struct(
-    "PictureOptions",
-    struct_size=c.c_uint32,
-    pixel_type=c.c_int32,
-    channels=c.c_int32,
-    interpolation=c.c_int32,
-    border=c.c_int32,
-    method=c.c_int32,
-    level=c.c_int32,
-    columns=c.c_int32,
-    rows=c.c_int32,
-    mesh_shape=c.c_int32 * 2,
-    reserved=c.c_int32,
-    spacing=c.c_double * 2,
-    origin=c.c_double * 2,
-    mesh_spacing=c.c_double * 2,
-    mesh_origin=c.c_double * 2,
-    border_value=c.c_double,
-    white=c.c_double,
-)
-NUMBERS = [
-    "diameter",
-    "lateral",
-    "axial",
-    "elevation",
-    "elevation_depth",
-    "element_height",
-    "f_number",
-    "dynamic_range",
-    "specular",
-    "lobe",
-    "lobe_elevation",
-    "steering",
-    "roughness",
-    "rolloff",
-    "wobble",
-    "patches",
-    "bevel",
-    "ring_down",
-    "ring_down_loss",
-    "opacity",
-]
-Needle: Any = struct(
-    "Needle",
-    struct_size=c.c_uint32,
-    parts=c.c_uint32,
-    seed=c.c_uint32,
-    curved=c.c_int32,
-    entry=c.c_double * 3,
-    tip=c.c_double * 3,
-    apex=c.c_double * 2,
-    **dict.fromkeys(NUMBERS, c.c_double),
-)
-Report: Any = struct(
-    "Report",
-    struct_size=c.c_uint32,
-    method=c.c_int32,
-    residual=c.c_double,
-    difference=c.c_double,
-    exact_share=c.c_double,
-    folded_cells=c.c_int64,
-    smallest_jacobian=c.c_double,
-    place=c.c_double * 2,
-)
+PictureOptions, Needle, Report = _native.PictureOptions, _native.Needle, _native.PictureReport
+NUMBERS = [name for name, kind in Needle._fields_ if kind is c.c_double]
 
 
 @cache
 def library() -> Any:
-    """Load the library once."""
-    lib = c.CDLL(str(library_path()))
-    picture, bytes_, count = c.c_void_p, c.c_int64, c.c_int64
-    signatures: dict[str, tuple[Any, ...]] = {
-        "picture_defaults": (c.c_void_p,),
-        "needle_defaults": (c.c_void_p,),
-        "picture_create": (c.c_void_p, c.c_void_p, c.c_void_p),
-        "picture_destroy": (picture,),
-        "picture_message": (picture,),
-        "picture_level": (picture,),
-        "picture_size": (picture,),
-        "picture_reference": (picture, c.c_void_p, bytes_),
-        "picture_deform": (picture, c.c_void_p, count),
-        "picture_deform_single": (picture, c.c_void_p, count),
-        "picture_draw": (picture, c.c_void_p, c.c_void_p, bytes_),
-        "picture_inverse": (picture, c.c_void_p, c.c_void_p, count),
-        "picture_check": (picture, c.c_void_p),
-        "picture_echo": (picture, c.c_void_p, c.c_void_p, count, c.c_void_p, c.c_void_p),
-        "level_available": (c.c_int32,),
-        "level_name": (c.c_int32,),
-        "level_best": (),
-    }
-    for name, arguments in signatures.items():
-        function = getattr(lib, "echospline_" + name)
-        function.argtypes = arguments
-        function.restype = c.c_int32
-    lib.echospline_picture_message.restype = lib.echospline_level_name.restype = c.c_char_p
-    lib.echospline_picture_size.restype = c.c_int64
-    lib.echospline_picture_destroy.restype = None
-    return lib
+    """Load the library once, as the package declares it."""
+    return _native.load(path) if (path := library_path()) else _native.library()
 
 
 def levels() -> list[int]:

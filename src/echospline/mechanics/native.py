@@ -9,7 +9,7 @@ from __future__ import annotations
 import ctypes
 import threading
 import weakref
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Any, Literal
@@ -288,7 +288,7 @@ def _options(
     o.precision = core.Precision.SINGLE if precision == "single" else core.Precision.DOUBLE
     o.tip = core.Tip.TIP_NODE if p.tip == "node" else core.Tip.TIP_POINT
     o.loading = core.Loading.IMMEDIATE if p.loading == "immediate" else core.Loading.FOLLOW
-    o.clamped = edge_bits(clamps.edges)
+    o.clamped = int(sum(core.Edge[edge.upper()] for edge in set(clamps.edges)))
     for d in (0, 1):
         o.shape[d], o.spacing[d], o.origin[d] = grid.shape[d], grid.spacing[d], grid.origin[d]
     o.sigma, o.delta, o.alpha1, o.alpha2, o.alpha3 = p.sigma, p.delta, p.alpha1, p.alpha2, p.alpha3
@@ -299,11 +299,6 @@ def _options(
     o.poisson, o.radius = elastic.nu, elastic.radius
     o.plane = core.Plane.PLANE_STRAIN if elastic.plane == "strain" else core.Plane.PLANE_STRESS
     return o
-
-
-def edge_bits(edges: Iterable[str]) -> int:
-    """Clamped edges as the core counts them."""
-    return int(sum(core.Edge[edge.upper()] for edge in set(edges)))
 
 
 def _destroy(library: Any, scene: ctypes.c_void_p, tissue: ctypes.c_void_p) -> None:
