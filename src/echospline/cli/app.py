@@ -14,6 +14,7 @@ from echospline.cli.info import info
 from echospline.cli.link import link
 from echospline.cli.live import live
 from echospline.cli.phantom import phantom
+from echospline.cli.reconstruct import reconstruct_command
 from echospline.cli.recorded import recorded
 from echospline.cli.sessions import sessions
 from echospline.cli.simulate import demo, simulate
@@ -44,6 +45,7 @@ app.command()(live)
 app.add_typer(sessions, name="sessions")
 app.command()(link)
 app.command()(recorded)
+app.command("reconstruct")(reconstruct_command)
 app.command()(phantom)
 app.command()(track)
 app.command()(dataset)

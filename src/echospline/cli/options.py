@@ -25,7 +25,8 @@ def _nodes(text: str) -> list[int]:
     return [int(part) for part in text.lower().split("x")]
 
 
-def _integers(text: str) -> list[int]:
+def integers(text: str) -> list[int]:
+    """Read whole numbers separated by commas."""
     return [int(part) for part in text.split(",")]
 
 
@@ -57,7 +58,7 @@ def _landmark(name: str, metavar: str) -> Option:
 OPTIONS = (
     Option("--spacing", "image.spacing", "LAT,DEPTH", _numbers, "Image"),
     Option("--frame", "image.frame", "N", int, "Image"),
-    Option("--region", "image.region", "L,T,R,B", _integers, "Image"),
+    Option("--region", "image.region", "L,T,R,B", integers, "Image"),
     Option("--mesh", "mesh.nodes", "NXxNY", _nodes, "Mesh"),
     Option("--clamped", "mesh.clamped", "EDGE,...", _words, "Mesh"),
     Option("--entry", "needle.entry", "X,Y", _numbers),

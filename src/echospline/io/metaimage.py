@@ -10,7 +10,7 @@ import numpy as np
 from echospline.errors import InputError
 from echospline.scene import Pixels, RegularGrid
 
-_TYPES = {
+ELEMENT_TYPES = {
     "int8": "MET_CHAR", "uint8": "MET_UCHAR", "int16": "MET_SHORT", "uint16": "MET_USHORT",
     "int32": "MET_INT", "uint32": "MET_UINT", "float32": "MET_FLOAT", "float64": "MET_DOUBLE",
 }  # fmt: skip
@@ -43,8 +43,8 @@ class MetaImageEncoder:
     def __init__(
         self, part: Path, grid: RegularGrid, colour: bool, dtype: np.dtype[np.generic], fps: float
     ) -> None:
-        if dtype.name not in _TYPES:
-            raise InputError(f"MetaImage holds pixels of {', '.join(_TYPES)}; got {dtype}")
+        if dtype.name not in ELEMENT_TYPES:
+            raise InputError(f"MetaImage holds pixels of {', '.join(ELEMENT_TYPES)}; got {dtype}")
         self._part, self._grid, self._colour = part, grid, colour
         self._dtype = dtype.newbyteorder("<")
         self._interval = 1.0 / fps
@@ -92,7 +92,7 @@ class MetaImageEncoder:
             f"DimSize = {nx} {ny} {count:<20d}",
             "Kinds = domain domain list",
             f"ElementNumberOfChannels = {3 if self._colour else 1}",
-            f"ElementType = {_TYPES[self._dtype.name]}",
+            f"ElementType = {ELEMENT_TYPES[self._dtype.name]}",
             "UltrasoundImageOrientation = MFA",
             "UltrasoundImageType = BRIGHTNESS",
         ]

@@ -9,6 +9,7 @@ from echospline.scene.needle import ZERO_LENGTH, Insertion, NeedlePose
 from echospline.scene.tissue import Circle, Label, Layer, Polygon, Region, Shape, Tissue
 from echospline.scene.transducer import FWHM, TRANSDUCERS, Transducer
 from echospline.scene.transform import as_transform, frames_of, transform_between
+from echospline.scene.volume import Volume, Voxels
 
 __all__ = [
     "AXIAL",
@@ -41,6 +42,8 @@ __all__ = [
     "Transducer",
     "UltrasoundImage",
     "Visible",
+    "Volume",
+    "Voxels",
     "as_points",
     "as_transform",
     "distance",
