@@ -165,17 +165,35 @@ class NeedleEcho:
         )
 
     def at(self, pose: NeedlePose) -> core.Needle:
-        """Return the core's needle with these looks."""
+        """Return the core's needle with these looks, in the plane of the picture."""
+        return self.between((*pose.entry, 0.0), (*pose.tip, 0.0))
+
+    def between(
+        self,
+        entry: tuple[float, float, float],
+        tip: tuple[float, float, float],
+        *,
+        apex: tuple[float, float] | None = None,
+    ) -> core.Needle:
+        """Return the core's needle with these looks.
+
+        Parameters
+        ----------
+        entry, tip : (x, y, z)
+            In the frame of the picture: lateral, depth, distance from the plane, mm.
+        apex : (x, y), optional
+            Where the probe's beams cross, mm, if these looks do not say.
+        """
         needle = core.Needle.from_buffer_copy(_defaults())
         for name in _NUMBERS:
             setattr(needle, name, getattr(self, name))
         needle.diameter = self.diameter
         parts = zip(core.NeedlePart, (self.shaft, self.tip, self.tail, self.shadow), strict=True)
         needle.parts = sum(part for part, drawn in parts if drawn)
-        if self.apex is not None:
-            needle.curved, needle.apex[0], needle.apex[1] = 1, *self.apex
-        needle.entry[0], needle.entry[1] = pose.entry
-        needle.tip[0], needle.tip[1] = pose.tip
+        crossing = apex if self.apex is None else self.apex
+        if crossing is not None:
+            needle.curved, needle.apex[0], needle.apex[1] = 1, *crossing
+        needle.entry[:], needle.tip[:] = entry, tip
         return needle
 
 

@@ -6,6 +6,8 @@ from echospline.scene.image import Cine, Pixels, UltrasoundImage
 from echospline.scene.imaging_plane import AXIAL, ImagingPlane, Reach, TrackedNeedle, Visible
 from echospline.scene.metrics import MOVED, FieldError, distance, field_error
 from echospline.scene.needle import ZERO_LENGTH, Insertion, NeedlePose
+from echospline.scene.probe import Probe
+from echospline.scene.space import PlanePath, SpatialGrid, SpatialInsertion, SpatialPose, probe_plane
 from echospline.scene.tissue import Circle, Label, Layer, Polygon, Region, Shape, Tissue
 from echospline.scene.transducer import FWHM, TRANSDUCERS, Transducer
 from echospline.scene.transform import as_transform, frames_of, transform_between
@@ -32,11 +34,16 @@ __all__ = [
     "Layer",
     "NeedlePose",
     "Pixels",
+    "PlanePath",
     "Polygon",
+    "Probe",
     "Reach",
     "Region",
     "RegularGrid",
     "Shape",
+    "SpatialGrid",
+    "SpatialInsertion",
+    "SpatialPose",
     "Tissue",
     "TrackedNeedle",
     "Transducer",
@@ -50,5 +57,6 @@ __all__ = [
     "field_error",
     "fourier_frequencies",
     "frames_of",
+    "probe_plane",
     "transform_between",
 ]

@@ -96,6 +96,11 @@ class ImagingPlane:
         lifted: Floats = points @ self.matrix[:3, :2].T + self.matrix[:3, 3]
         return lifted
 
+    def lower(self, points: Floats) -> Floats:
+        """Convert points of the reference frame (n, 3) mm to the plane's, shape (n, 3): the third is the distance from it."""
+        lowered: Floats = (points - self.matrix[:3, 3]) @ np.linalg.inv(self.matrix[:3, :3]).T
+        return lowered
+
     def see(
         self, tip_to_reference: Floats, axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
     ) -> TrackedNeedle:

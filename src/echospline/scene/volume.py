@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -97,6 +97,59 @@ class Volume:
             weight = np.prod(np.where(corner, share, 1.0 - share), axis=1)
             value += weight * self.voxels[z, y, x]
         return np.where(inside, value, outside)
+
+    def windowed(self, low: float, high: float) -> Volume:
+        """Return 8-bit voxels: ``low`` becomes 0, ``high`` 255, beyond them they are cut.
+
+        Raises
+        ------
+        InputError
+            If high is not above low.
+        """
+        if not (np.isfinite([low, high]).all() and high > low):
+            raise InputError(f"a window goes from a lower to a higher value; got {low} to {high}")
+        scaled = np.clip(
+            (self.voxels.astype(np.float32) - low) * np.float32(255.0 / (high - low)), 0.0, 255.0
+        )
+        return replace(self, voxels=np.rint(scaled).astype(np.uint8))
+
+    def with_depth(self, axis: str) -> Volume:
+        """Turn the volume so that its depth runs along y: the scene's frame, with the surface at y = 0.
+
+        Parameters
+        ----------
+        axis : {"x", "-x", "y", "-y", "z", "-z"}
+            The volume's axis along which depth grows.
+
+        Returns
+        -------
+        Volume
+            x and z stay right-handed with y; x begins at minus half its size, as does z.
+
+        Raises
+        ------
+        InputError
+            If the axis has another name.
+        """
+        turns = {  # for the new x, y and z: which old axis, and whether it is reversed
+            "y": ((0, False), (1, False), (2, False)),
+            "-y": ((0, True), (1, True), (2, False)),
+            "z": ((0, False), (2, False), (1, True)),
+            "-z": ((0, False), (2, True), (1, False)),
+            "x": ((2, False), (0, False), (1, False)),
+            "-x": ((2, True), (0, True), (1, False)),
+        }
+        if axis not in turns:
+            raise InputError(f"depth runs along one of {', '.join(turns)}; got {axis!r}")
+        turn = turns[axis]
+        order = [2 - old for old, _ in turn[::-1]]
+        flips = tuple(slice(None, None, -1 if flip else 1) for _, flip in turn[::-1])
+        voxels = np.ascontiguousarray(self.voxels.transpose(order)[flips])
+        filled = None if self.filled is None else np.ascontiguousarray(self.filled.transpose(order)[flips])
+        sx, sy, sz = (self.spacing[old] for old, _ in turn)
+        nz, _, nx = voxels.shape
+        origin = (-0.5 * (nx - 1) * sx, 0.0, -0.5 * (nz - 1) * sz)
+        return replace(self, voxels=voxels, filled=filled, spacing=(sx, sy, sz), origin=origin)
 
     def _index(self, points: ArrayLike) -> Floats:
         p = as_points(points, "points", 3)

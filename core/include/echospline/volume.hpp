@@ -1,0 +1,132 @@
+// A volume of 8-bit voxels and pictures of bent slices through it.
+//
+// Voxels are packed once: each with its neighbours along x and y in one word, so that a sample between eight voxels is two loads. A
+// picture comes from a lattice of places in the reference, one every few pixels, between which places are interpolated. The slice has a
+// thickness: across it three samples, weighted as Gauss and Hermite do, stand for the beam's profile.
+#pragma once
+#include "array.hpp"
+#include "gathering.hpp"
+#include "sampling.hpp"
+
+namespace echospline::ECHOSPLINE_CORE {
+
+class Volume {
+ public:
+  /// Copy and pack voxels; false when memory runs out.
+  bool prepare(const echospline_volume_options& options, const uint8_t* voxels) {
+    for (int k = 0; k < 3; ++k) {
+      shape_[k] = options.shape[k];
+      scale_[k] = 1.0 / options.spacing[k];
+      origin_[k] = options.origin[k];
+    }
+    const int64_t layer = int64_t(shape_[0]) * shape_[1];
+    if (!words_.reserve(layer * shape_[2])) return false;
+    for (int z = 0; z < shape_[2]; ++z) pack(voxels + z * layer, 1, 0, shape_[0], shape_[1], words_.data() + z * layer);
+    return true;
+  }
+
+  /// Draw a bent slice. Returns the number of shown pixels whose place lies outside the volume; -1 when memory runs out.
+  int64_t slice(const echospline_slice& s, const double* lattice, uint8_t* out) const {
+    const int across = (s.columns - 1 + s.step - 1) / s.step + 1, lines = (s.rows - 1 + s.step - 1) / s.step + 1;
+    const int padded = static_cast<int>(rounded_up(s.columns, LANES));
+    Array<int32_t> cell;
+    Array<float> share, line;
+    if (!cell.reserve(padded) || !share.reserve(padded) || !line.reserve(3 * int64_t(across + 1))) return -1;
+    for (int k = 0; k < padded; ++k) {
+      const int column = smaller(k, s.columns - 1);
+      cell[k] = smaller(column / s.step, larger(across - 2, 0));
+      share[k] = static_cast<float>(column - cell[k] * s.step) / static_cast<float>(s.step);
+    }
+    const int stride = across + 1;
+    int64_t outside = 0;
+    for (int row = 0; row < s.rows; ++row) {
+      const int above = smaller(row / s.step, larger(lines - 2, 0));
+      const double down = static_cast<double>(row - above * s.step) / s.step;
+      const double* upper = lattice + int64_t(above) * across * 3;
+      const double* lower = lines > 1 ? upper + int64_t(across) * 3 : upper;
+      for (int i = 0; i < stride; ++i)
+        for (int k = 0; k < 3; ++k) {
+          const int at = 3 * smaller(i, across - 1) + k;
+          line[int64_t(k) * stride + i] =
+              static_cast<float>((upper[at] + down * (lower[at] - upper[at]) - origin_[k]) * scale_[k]);
+        }
+      const float spread = s.spread ? s.spread[row] : 0.0f;
+      Floats aside[3];
+      for (int k = 0; k < 3; ++k) aside[k] = all(static_cast<float>(s.normal[k] * scale_[k]) * spread);
+      for (int first = 0; first < s.columns; first += LANES) {
+        const Ints at = load_ints(cell.data() + first);
+        const Floats right = load(share.data() + first);
+        Floats place[3];
+        for (int k = 0; k < 3; ++k) {
+          const float* from = line.data() + int64_t(k) * stride;
+          const Floats a = gather(from, at), b = gather(from + 1, at);
+          place[k] = a + right * (b - a);
+        }
+        Ints inside;
+        Floats value = sample_at(place, inside);
+        if (spread > 0) value = across_slice(place, aside, value);
+        const Ints grey = pick(inside, to_ints(value + 0.5f), all_ints(s.background));
+        const int here = smaller(LANES, s.columns - first);
+        const int64_t to = int64_t(row) * s.columns + first;
+        for (int i = 0; i < here; ++i) {
+          const bool shown = !s.mask || s.mask[to + i];
+          out[to + i] = static_cast<uint8_t>(shown ? grey[i] : s.background);
+          outside += shown && !inside[i];
+        }
+      }
+    }
+    return outside;
+  }
+
+ private:
+  static Ints load_ints(const int32_t* p) {
+    Ints v;
+    std::memcpy(&v, p, sizeof v);
+    return v;
+  }
+  /// Brightness between eight voxels, and whether the place lies between the outermost ones.
+  Floats sample_at(const Floats* place, Ints& inside) const {
+    inside = all_ints(-1);
+    Ints cell[3];
+    Floats share[3];
+    for (int k = 0; k < 3; ++k) {
+      const float last = static_cast<float>(shape_[k] - 1);
+      inside &= (place[k] >= -1e-3f) & (place[k] <= last + 1e-3f);  // no where a place is not a number
+      const Floats p = within(place[k], 0.0f, last);
+      const Ints c = to_ints(p);
+      cell[k] = c > all_ints(larger(shape_[k] - 2, 0)) ? all_ints(larger(shape_[k] - 2, 0)) : c;
+      share[k] = p - to_floats(cell[k]);
+    }
+    const int32_t layer = shape_[0] * shape_[1];
+    const Ints at = (cell[2] * shape_[1] + cell[1]) * shape_[0] + cell[0];
+    const Floats near = between(gather(words_.data(), at), share);
+    const Floats far = between(gather(words_.data(), at + (shape_[2] > 1 ? layer : 0)), share);
+    return near + share[2] * (far - near);
+  }
+  static Floats between(Words word, const Floats* share) {
+    const Floats a = to_floats((Ints)(word & 255)), b = to_floats((Ints)((word >> 8) & 255));
+    const Floats c = to_floats((Ints)((word >> 16) & 255)), d = to_floats((Ints)(word >> 24));
+    const Floats top = a + share[0] * (b - a), bottom = c + share[0] * (d - c);
+    return top + share[1] * (bottom - top);
+  }
+  /// Mean over the slice's thickness: two more samples at sqrt(3) sigma, of a sixth of the weight each; outside counts as the middle.
+  Floats across_slice(const Floats* place, const Floats* aside, Floats middle) const {
+    Floats sum = middle * (2.0f / 3.0f);
+    for (int sign = 0; sign < 2; ++sign) {
+      const float side = sign ? 1.7320508f : -1.7320508f;
+      Floats moved[3];
+      for (int k = 0; k < 3; ++k) moved[k] = place[k] + side * aside[k];
+      Ints inside;
+      const Floats value = sample_at(moved, inside);
+      sum += pick(inside, value, middle) * (1.0f / 6.0f);
+    }
+    return sum;
+  }
+
+  Array<uint32_t> words_;
+  int32_t shape_[3] = {0, 0, 0};
+  double scale_[3] = {0, 0, 0};  // voxels per mm
+  double origin_[3] = {0, 0, 0};
+};
+
+}  // namespace echospline::ECHOSPLINE_CORE

@@ -1,0 +1,349 @@
+"""Elastic tissue in space that answers point forces: closed forms, and forces outside its faces that make the faces what they are.
+
+The closed form (`half_space.kelvinlet`) knows the surface, free or under a probe. What the other faces do is smooth inside the tissue, and
+is made by point forces a little outside them whose strengths are least squares over rows of points on the faces: the method of fundamental
+solutions (G. Fairweather and A. Karageorghis, Adv. Comput. Math. 9, 1998). No mesh is needed, and the field is known at every point.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from echospline import _native as core
+from echospline.errors import InputError
+from echospline.mechanics.half_space import Top, gradient, kelvinlet, tractions
+from echospline.mechanics.landmarks import SIDES, Clamps
+from echospline.scene import Floats, SpatialGrid, Tissue, as_points
+
+Kind = Literal["clamped", "sliding", "free"]
+
+TOPS = {None: core.SpaceTop.TOP_NONE, "free": core.SpaceTop.TOP_FREE, "sliding": core.SpaceTop.TOP_SLIDING}
+SPACING = 0.19
+"""Distance between boundary forces, and of them from the faces, as a share of the edge of a cube as large as the tissue."""
+ROWS = 0.44
+"""Distance between the rows' points as a share of that between forces: equal spacing fails."""
+PROLONGED = 0.5
+"""Boundary forces reach this share of their spacing beyond the edges of a face."""
+TRACTION = 10.0
+"""mm; what a traction over mu is multiplied by to weigh as much as a displacement."""
+
+
+@dataclass(frozen=True, eq=False)
+class ForceField:
+    """Displacement of tissue under point forces, at any points.
+
+    Parameters
+    ----------
+    places, forces : ndarray, shape (m, 3)
+        mm and N; boundary forces and needle alike.
+    radii : ndarray, shape (m,)
+        Over which each is spread, mm.
+    motion : ndarray, shape (6,)
+        Shift (mm) and turn (mm per mm about the tissue's middle) of the whole.
+    young, poisson : float
+        E (kPa) and nu.
+    top : {"free", "sliding"} or None
+        What the surface y = 0 is.
+    middle : ndarray, shape (3,)
+        mm.
+    """
+
+    places: Floats
+    forces: Floats
+    radii: Floats
+    motion: Floats
+    young: float
+    poisson: float
+    top: Top | None
+    middle: Floats
+
+    def __call__(self, points: Floats) -> Floats:
+        """Displacement (n, 3) in mm at points (n, 3) in mm; above the surface it goes on as it is there.
+
+        Raises
+        ------
+        InputError
+            If the core refuses a number.
+        """
+        p = np.array(points, dtype=np.float64)
+        if self.top is not None:
+            np.maximum(p[:, 1], 0.0, out=p[:, 1])
+        f = core.ForceField(
+            struct_size=ctypes.sizeof(core.ForceField), top=TOPS[self.top], poisson=self.poisson
+        )
+        f.shear_modulus, f.force_count = shear_modulus(self.young, self.poisson), len(self.places)
+        places, forces, radii = (
+            np.ascontiguousarray(v, dtype=np.float64) for v in (self.places, self.forces, self.radii)
+        )
+        f.places, f.forces, f.radii = places.ctypes.data, forces.ctypes.data, radii.ctypes.data
+        u = np.empty_like(p)
+        status = core.library().echospline_force_field_at(
+            ctypes.byref(f), p.ctypes.data, len(p), u.ctypes.data
+        )
+        if status != core.Status.OK:
+            text: bytes = core.library().echospline_status_text(status)
+            raise InputError(
+                f"the field of {len(places)} forces at {len(p)} points cannot be summed ({text.decode()}): forces lie below the "
+                "surface, and every number is finite and below 1e6 mm"
+            )
+        if self.motion.any():
+            u += np.einsum("nij,j->ni", rigid_motions(p - self.middle), self.motion)
+        return u
+
+
+class SpaceResponse:
+    """Homogeneous tissue, a block held at its faces, answering point forces.
+
+    Parameters
+    ----------
+    grid : SpatialGrid
+        Its corners are the block's; the top is y = 0.
+    clamps : Clamps
+        Faces that are clamped or slide. A top that is neither is a free surface.
+    tissue : Tissue
+        Homogeneous; E and nu.
+    radius : float
+        Over which a force of the needle is spread, mm. Tissue folds where a force exceeds about 10 E e^2.
+
+    Raises
+    ------
+    InputError
+        If the tissue has regions or is incompressible, points are clamped, or the surface is not y = 0.
+    """
+
+    def __init__(self, grid: SpatialGrid, clamps: Clamps, tissue: Tissue, *, radius: float = 0.7) -> None:
+        if not tissue.homogeneous:
+            raise InputError(
+                "the closed form in space is that of homogeneous tissue; for tissue with regions use finite elements (fem)"
+            )
+        if not -1 < tissue.poisson < 0.5:
+            raise InputError(
+                f"Poisson's ratio in space must lie in (-1, 0.5); got {tissue.poisson}: take 0.49 for nearly incompressible tissue"
+            )
+        if len(clamps.points):
+            raise InputError("points cannot be clamped in space by green; clamp a face, or use elastic")
+        if not (np.isfinite(radius) and radius > 0):
+            raise InputError(f"radius of a force must be a positive number in mm; got {radius}")
+        low, _ = grid.corners
+        kinds: dict[str, Kind] = {face: clamps.kind(face) for face in SIDES}
+        self.top: Top | None = None
+        if kinds["top"] == "free" or kinds["top"] == "sliding":
+            self.top = "free" if kinds["top"] == "free" else "sliding"
+            if abs(low[1]) > 1e-6:
+                raise InputError(f"the surface of tissue in space is y = 0; the mesh begins at {low[1]:g} mm")
+        self.grid, self.clamps, self.tissue, self.radius, self.kinds = grid, clamps, tissue, radius, kinds
+        self._solve = self._least_squares()
+
+    @property
+    def mu(self) -> float:
+        """Shear modulus, N/mm^2."""
+        return shear_modulus(self.tissue.young, self.tissue.poisson)
+
+    @property
+    def middle(self) -> Floats:
+        """Middle of the block, mm."""
+        low, high = self.grid.corners
+        middle: Floats = (low + high) / 2
+        return middle
+
+    @cached_property
+    def spacing(self) -> float:
+        """Distance between boundary forces, mm."""
+        low, high = self.grid.corners
+        return float(SPACING * np.prod(high - low) ** (1 / 3))
+
+    @cached_property
+    def sources(self) -> Floats:
+        """Places of the boundary forces, shape (m, 3) mm."""
+        return np.concatenate([self._face(face, self.spacing, self.spacing) for face in self._faces])
+
+    @cached_property
+    def rows(self) -> dict[str, Floats]:
+        """Points on every face at which its condition is asked for, mm."""
+        return {face: self._face(face, ROWS * self.spacing, 0.0) for face in self._faces}
+
+    @property
+    def _faces(self) -> tuple[str, ...]:
+        return tuple(face for face in SIDES if face != "top" or self.top is None)
+
+    @property
+    def _scale(self) -> float:
+        return 1.0 / (16.0 * np.pi * self.mu * (1.0 - self.tissue.poisson))
+
+    def field(self, places: Floats, forces: Floats) -> ForceField:
+        """Return the field under point forces of the needle.
+
+        Parameters
+        ----------
+        places, forces : ndarray, shape (m, 3)
+            mm and N.
+
+        Raises
+        ------
+        InputError
+            If a place lies outside the tissue.
+        """
+        p, f = as_points(places, "places", 3), as_points(forces, "forces", 3)
+        if not self.grid.contains(p).all():
+            where = tuple(float(c) for c in p[np.flatnonzero(~self.grid.contains(p))[0]])
+            raise InputError(f"forces act inside the tissue; got one at {where} mm")
+        p = self._below(p)
+        answer = self._solve @ self._conditions(
+            lambda c: self._moves(c, p, f), lambda c, n: self._pulls(c, n, p, f)
+        )
+        m = 3 * len(self.sources)
+        return ForceField(
+            np.concatenate([p, self.sources]),
+            np.concatenate([f, answer[:m].reshape(-1, 3)]),
+            np.concatenate([np.full(len(p), self.radius), np.full(len(self.sources), 1e-3 * self.spacing)]),
+            self._motions(answer[m:]),
+            self.tissue.young,
+            self.tissue.poisson,
+            self.top,
+            self.middle,
+        )
+
+    def answer(self, places: Floats, forces: Floats, points: Floats) -> tuple[Floats, Floats]:
+        """Displacement of the mesh (n, 3, k) and of points (p, 3, k) in mm under k load cases (m, 3, k) in N at places (m, 3)."""
+        every = np.concatenate([self.grid.nodes, points])
+        fields = [self.field(places, forces[:, :, k])(every) for k in range(forces.shape[2])]
+        u = np.stack(fields, axis=2) if fields else np.zeros((len(every), 3, 0))
+        return u[: self.grid.size], u[self.grid.size :]
+
+    def at(self, places: Floats, forces: Floats, points: Floats) -> Floats:
+        """Displacement of points (p, 3, k) in mm under k load cases, without the mesh."""
+        fields = [self.field(places, forces[:, :, k])(points) for k in range(forces.shape[2])]
+        return np.stack(fields, axis=2) if fields else np.zeros((len(points), 3, 0))
+
+    def describe(self) -> str:
+        """Return in one sentence how the tissue is solved."""
+        surface = {
+            None: "in space without a surface",
+            "free": "under a free surface",
+            "sliding": "under a probe's face",
+        }[self.top]
+        return f"closed form {surface} and {len(self.sources)} forces outside the faces"
+
+    def _least_squares(self) -> Floats:
+        """Return the matrix from conditions that the needle violates to boundary forces (N) and motions."""
+        nu = self.tissue.poisson
+        count = 3 * len(self.sources)
+        matrix = self._conditions(
+            lambda c: (self._scale * kelvinlet(c, self.sources, nu, 0.0, self.top)).reshape(len(c), 3, count),
+            lambda c, n: (
+                self._scale
+                * tractions(gradient(c, self.sources, nu, 0.0, self.top), n, nu).reshape(len(c), 3, count)
+            ),
+        )
+        allowed = self._allowed()
+        shifts = self._conditions(
+            lambda c: rigid_motions(c - self.middle)[:, :, allowed],
+            lambda c, n: np.zeros((len(c), 3, len(allowed))),
+        )
+        # columns of one size: a force of 1 N moves little, a shift of 1 mm much
+        size = np.abs(matrix).max()
+        U, s, Vt = np.linalg.svd(np.hstack([matrix / size, shifts]), full_matrices=False)
+        kept = s > 1e-8 * s[0]
+        solution: Floats = -(Vt[kept].T / s[kept]) @ U[:, kept].T
+        solution[:count] /= size
+        return solution
+
+    def _conditions(
+        self, moves: Callable[[Floats], Floats], pulls: Callable[[Floats, Floats], Floats]
+    ) -> Floats:
+        """Stack what every face must hold at zero, given displacements and tractions over mu at its points, (n, 3[, k])."""
+        stacked = []
+        for face, points in self.rows.items():
+            axis, side = SIDES[face]
+            kind = self.kinds[face]
+            normal = np.zeros((len(points), 3))
+            normal[:, axis] = 1.0 if side else -1.0
+            if kind == "clamped":
+                rows = moves(points)
+            elif kind == "free":
+                rows = TRACTION * pulls(points, normal)
+            else:
+                rows = TRACTION * pulls(points, normal)
+                rows[:, axis] = moves(points)[:, axis]
+            stacked.append(rows.reshape(3 * len(points), *rows.shape[2:]))
+        return np.concatenate(stacked)
+
+    def _moves(self, points: Floats, places: Floats, forces: Floats) -> Floats:
+        K = kelvinlet(points, places, self.tissue.poisson, self.radius, self.top)
+        u: Floats = self._scale * np.einsum("nimj,mj->ni", K, forces)
+        return u
+
+    def _pulls(self, points: Floats, normals: Floats, places: Floats, forces: Floats) -> Floats:
+        nu = self.tissue.poisson
+        T = tractions(gradient(points, places, nu, self.radius, self.top), normals, nu)
+        t: Floats = self._scale * np.einsum("nimj,mj->ni", T, forces)
+        return t
+
+    def _below(self, places: Floats) -> Floats:
+        """Keep forces at least their radius below a surface: the image is that of a point."""
+        if self.top is None:
+            return places
+        deep = places.copy()
+        deep[:, 1] = np.maximum(deep[:, 1], self.radius)
+        return deep
+
+    def _allowed(self) -> list[int]:
+        """Rigid motions that the surface of the closed form allows."""
+        return [0, 2, 4] if self.top == "sliding" else list(range(6))
+
+    def _motions(self, some: Floats) -> Floats:
+        motion = np.zeros(6)
+        motion[self._allowed()] = some
+        return motion
+
+    def _face(self, face: str, spacing: float, out: float) -> Floats:
+        """Points in a face, about ``spacing`` apart, moved out by ``out`` and prolonged by half as much beyond its edges.
+
+        Under a free surface they stand closer the shallower they are: where it meets a clamped face the stress is singular.
+        """
+        axis, side = SIDES[face]
+        low, high = self.grid.corners
+        lines = []
+        for k in range(3):
+            if k == axis:
+                lines.append(np.array([high[k] + out if side else low[k] - out]))
+                continue
+            first, last = float(low[k] - PROLONGED * out), float(high[k] + PROLONGED * out)
+            under = k == 1 and self.top is not None
+            if under:
+                first = float(low[k])  # nothing above a surface
+            count = max(2, round((last - first) / spacing))
+            share = (np.arange(count) + 0.5) / count
+            lines.append(first + (share**2 if under and self.top == "free" else share) * (last - first))
+        Z, Y, X = np.meshgrid(*lines[::-1], indexing="ij")
+        return np.stack([X.ravel(), Y.ravel(), Z.ravel()], axis=1)
+
+
+def shear_modulus(young: float, poisson: float) -> float:
+    """Shear modulus in N/mm^2 from E in kPa and nu."""
+    return 1e-3 * young / (2.0 * (1.0 + poisson))
+
+
+def rigid_motions(points: Floats) -> Floats:
+    """Three shifts and three turns at points (n, 3), shape (n, 3, 6)."""
+    motions = np.zeros((len(points), 3, 6))
+    motions[:, :, :3] = np.eye(3)
+    for k, unit in enumerate(np.eye(3)):
+        motions[:, :, 3 + k] = np.cross(unit, points)
+    return motions
+
+
+def block(
+    size: Iterable[float], kinds: Mapping[str, Kind], shape: tuple[int, int, int] = (9, 8, 7)
+) -> tuple[SpatialGrid, Clamps]:
+    """Return the mesh and clamps of a block of tissue: ``size`` (x, y, z) mm, x and z about 0, its surface at y = 0."""
+    x, y, z = size
+    grid = SpatialGrid.spanning((-x / 2, 0.0, -z / 2), (x / 2, y, z / 2), shape)
+    clamped = [face for face, kind in kinds.items() if kind == "clamped"]
+    return grid, Clamps.of(grid, clamped, sliding=[face for face, kind in kinds.items() if kind == "sliding"])
