@@ -1,6 +1,7 @@
 // A volume of 8-bit voxels and pictures of bent slices through it.
 //
-// Voxels are packed once: each with its neighbours along x and y in one word, so that a sample between eight voxels is two loads. A
+// Voxels are packed once: each with its neighbours along x and y in one word, so that a sample between eight voxels is two loads; and
+// words that are close in space are close in memory, in bricks of 8 x 8 x 8, so that a slice costs the same whatever its direction. A
 // picture comes from a lattice of places in the reference, one every few pixels, between which places are interpolated. The slice has a
 // thickness: across it three samples, weighted as Gauss and Hermite do, stand for the beam's profile.
 #pragma once
@@ -84,6 +85,13 @@ class Volume {
     std::memcpy(&v, p, sizeof v);
     return v;
   }
+  /// Place of a word in memory: of its brick, then within it.
+  template <class Whole>
+  Whole index_of(Whole x, Whole y, Whole z) const {
+    const Whole brick = ((z >> 3) * bricks_[1] + (y >> 3)) * bricks_[0] + (x >> 3);
+    return (brick << 9) | ((z & 7) << 6) | ((y & 7) << 3) | (x & 7);
+  }
+
   /// Brightness between eight voxels, and whether the place lies between the outermost ones.
   Floats sample_at(const Floats* place, Ints& inside) const {
     inside = all_ints(-1);
@@ -97,10 +105,8 @@ class Volume {
       cell[k] = c > all_ints(larger(shape_[k] - 2, 0)) ? all_ints(larger(shape_[k] - 2, 0)) : c;
       share[k] = p - to_floats(cell[k]);
     }
-    const int32_t layer = shape_[0] * shape_[1];
-    const Ints at = (cell[2] * shape_[1] + cell[1]) * shape_[0] + cell[0];
-    const Floats near = between(gather(words_.data(), at), share);
-    const Floats far = between(gather(words_.data(), at + (shape_[2] > 1 ? layer : 0)), share);
+    const Floats near = between(gather(words_.data(), index_of(cell[0], cell[1], cell[2])), share);
+    const Floats far = between(gather(words_.data(), index_of(cell[0], cell[1], cell[2] + (shape_[2] > 1))), share);
     return near + share[2] * (far - near);
   }
   static Floats between(Words word, const Floats* share) {
@@ -123,7 +129,10 @@ class Volume {
     return sum;
   }
 
+  static constexpr int SIDE = 8;  // voxels along a brick: the shifts of `index_of` say the same
+
   Array<uint32_t> words_;
+  int32_t bricks_[2] = {0, 0};
   int32_t shape_[3] = {0, 0, 0};
   double scale_[3] = {0, 0, 0};  // voxels per mm
   double origin_[3] = {0, 0, 0};
