@@ -6,7 +6,7 @@ import pytest
 from echospline.errors import InputError
 from echospline.mechanics.half_space import kelvinlet
 from echospline.mechanics.landmarks import SIDES, Clamps
-from echospline.mechanics.space_response import ForceField, SpaceResponse, block
+from echospline.mechanics.space_response import ForceField, Forces, Lattice, SpaceResponse, block
 from echospline.scene import Circle, Region, SpatialGrid, Tissue
 from space_reference import Corrected
 
@@ -74,7 +74,7 @@ def test_the_core_sums_forces_as_the_closed_form_says():
     forces, radii = rng.normal(size=(50, 3)), rng.uniform(0.1, 2.0, 50)
     points = rng.uniform([-20, 0, -15], [20, 35, 15], (300, 3))
     for top in (None, "free", "sliding"):
-        field = ForceField(places, forces, radii, np.zeros(6), 10.0, 0.45, top, np.zeros(3))
+        field = ForceField(Forces(places, forces, radii), 10.0, 0.45, top)
         mu = 1e-2 / 2.9
         exact = sum(
             np.einsum(
@@ -83,6 +83,24 @@ def test_the_core_sums_forces_as_the_closed_form_says():
             for j in range(50)
         ) / (16 * np.pi * mu * 0.55)
         np.testing.assert_allclose(field(points), exact, atol=2e-5 * np.abs(exact).max())
+
+
+def test_a_smooth_displacement_on_a_lattice_is_kept_between_its_points():
+    def smooth(p):
+        return np.stack(
+            [np.sin(p[:, 0] / 9), np.cos(p[:, 1] / 8) * p[:, 2] / 9, p[:, 0] * p[:, 1] / 300], axis=1
+        )
+
+    spacing, origin, shape = np.array([2.5, 2.0, 3.0]), np.array([-20.0, -3.0, -15.0]), (17, 20, 11)
+    grid = SpatialGrid(shape, tuple(spacing), tuple(origin))
+    lattice = Lattice(spacing, origin, smooth(grid.nodes).reshape(*shape[::-1], 3))
+    none = Forces(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+    low, high = grid.corners
+    points = np.random.default_rng(1).uniform(low + spacing, high - spacing, (500, 3))
+    u = ForceField(none, 10.0, 0.45, None, lattice)(points)
+    np.testing.assert_allclose(u, smooth(points), atol=4e-3)
+    inner = grid.nodes[((grid.nodes > low + 0.5 * spacing) & (grid.nodes < high - 0.5 * spacing)).all(axis=1)]
+    np.testing.assert_allclose(ForceField(none, 10.0, 0.45, None, lattice)(inner), smooth(inner), atol=1e-12)
 
 
 def test_displacement_is_linear_in_the_forces_and_falls_with_stiffness():

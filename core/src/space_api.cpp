@@ -158,6 +158,19 @@ echospline_status echospline_force_field_at(const echospline_force_field* field,
   }
   for (int64_t k = 0; k < 3 * count; ++k)
     if (!near_enough(points[k])) return ECHOSPLINE_WRONG_VALUE;
+  if (field->lattice) {
+    int64_t numbers = 3;
+    for (int k = 0; k < 3; ++k) {
+      if (field->lattice_shape[k] < 4 || field->lattice_shape[k] > MOST_ALONG) return ECHOSPLINE_WRONG_SIZE;
+      if (!(field->lattice_spacing[k] >= 1e-4 && field->lattice_spacing[k] <= FURTHEST) ||
+          !near_enough(field->lattice_origin[k]))
+        return ECHOSPLINE_WRONG_VALUE;
+      numbers *= field->lattice_shape[k];
+    }
+    if (numbers > MOST_VOXELS) return ECHOSPLINE_WRONG_SIZE;
+    for (int64_t k = 0; k < numbers; ++k)
+      if (!near_enough(field->lattice[k])) return ECHOSPLINE_WRONG_VALUE;
+  }
   return level->space->force_field(*field, points, count, displacement) ? ECHOSPLINE_OK : ECHOSPLINE_OUT_OF_MEMORY;
 }
 

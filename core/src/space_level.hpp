@@ -41,6 +41,14 @@ bool sum_forces(const echospline_force_field& field, const double* points, int64
     force_field<Top::sliding>(forces.data(), field.force_count, nu, points, count, displacement);
   else
     force_field<Top::none>(forces.data(), field.force_count, nu, points, count, displacement);
+  if (field.lattice) {
+    SmoothLattice smooth = {field.lattice, {}, {}, {}};
+    for (int k = 0; k < 3; ++k) {
+      smooth.shape[k] = field.lattice_shape[k];
+      smooth.per_mm[k] = 1.0 / field.lattice_spacing[k], smooth.origin[k] = field.lattice_origin[k];
+    }
+    for (int64_t i = 0; i < count; ++i) smooth.add(points + 3 * i, displacement + 3 * i);
+  }
   return true;
 }
 

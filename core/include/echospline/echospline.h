@@ -403,7 +403,8 @@ enum {                            /* what the surface y = 0 of elastic tissue is
        ECHOSPLINE_TOP_SLIDING = 2 /* a frictionless face lies on it: skin under a probe */
 };
 
-/* Point forces in homogeneous elastic tissue in space; with a surface they lie below it. */
+/* Point forces in homogeneous elastic tissue in space; with a surface they lie below it. A displacement that is smooth, what forces
+ * far away do, may be given on a lattice instead, and is added between its points by cubic convolution. */
 typedef struct echospline_force_field {
   uint32_t struct_size;
   int32_t level;
@@ -415,6 +416,11 @@ typedef struct echospline_force_field {
   const double* forces; /* (force_count, 3) N */
   const double* radii;  /* (force_count) over which a force is spread, mm, positive */
   int64_t force_count;
+  int32_t lattice_shape[3]; /* points along x, y, z, 4 or more each; not read where lattice is NULL */
+  int32_t lattice_reserved;
+  double lattice_spacing[3]; /* mm */
+  double lattice_origin[3];  /* mm */
+  const double* lattice;     /* (nz, ny, nx, 3) displacement, mm, or NULL */
 } echospline_force_field;
 
 /* Displacement (count, 3) mm at points (count, 3) mm, in single precision, on or below the surface. */

@@ -62,6 +62,38 @@ inline void add_forces(const PointForce* forces, int64_t count, float nu, Floats
   }
 }
 
+/// A smooth displacement on a lattice, between its points by cubic convolution (R. G. Keys, IEEE Trans. ASSP 29, 1981).
+struct SmoothLattice {
+  const double* values;  // (nz, ny, nx, 3) mm
+  int32_t shape[3];
+  double per_mm[3], origin[3];
+
+  /// Add the displacement at a point; beyond the lattice its outermost cells go on.
+  void add(const double* point, double* u) const {
+    int first[3];
+    double weights[3][4];
+    for (int k = 0; k < 3; ++k) {
+      const double index = (point[k] - origin[k]) * per_mm[k];
+      const int cell = static_cast<int>(smaller(larger(index, 1.0), shape[k] - 3.0));
+      const double t = smaller(larger(index - cell, -1.0), 2.0);
+      first[k] = cell - 1;
+      weights[k][0] = ((-0.5 * t + 1.0) * t - 0.5) * t;
+      weights[k][1] = (1.5 * t - 2.5) * t * t + 1.0;
+      weights[k][2] = ((-1.5 * t + 2.0) * t + 0.5) * t;
+      weights[k][3] = (0.5 * t - 0.5) * t * t;
+    }
+    for (int z = 0; z < 4; ++z)
+      for (int y = 0; y < 4; ++y) {
+        const double across = weights[2][z] * weights[1][y];
+        const double* row = values + 3 * ((int64_t(first[2] + z) * shape[1] + first[1] + y) * shape[0] + first[0]);
+        for (int x = 0; x < 4; ++x) {
+          const double w = across * weights[0][x];
+          for (int k = 0; k < 3; ++k) u[k] += w * row[3 * x + k];
+        }
+      }
+  }
+};
+
 /// Displacement (count, 3) at points (count, 3), mm.
 template <Top TOP>
 inline void force_field(const PointForce* forces, int64_t force_count, float nu, const double* points, int64_t count,

@@ -342,6 +342,11 @@ class ForceField(ctypes.Structure):
         ("forces", c_void_p),
         ("radii", c_void_p),
         ("force_count", c_int64),
+        ("lattice_shape", c_int32 * 3),
+        ("lattice_reserved", c_int32),
+        ("lattice_spacing", c_double * 3),
+        ("lattice_origin", c_double * 3),
+        ("lattice", c_void_p),
     ]
 
 

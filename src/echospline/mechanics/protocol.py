@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Generic, Protocol, TypeVar
 
 from numpy.typing import ArrayLike
 
-from echospline.scene import Floats, NeedlePose, RegularGrid
+from echospline.scene import Floats, NeedlePose, RegularGrid, SpatialGrid, SpatialPose
 
 State = TypeVar("State")
 
@@ -37,4 +38,25 @@ class TissueModel(Protocol, Generic[State]):
 
     def displacement_at(self, state: State, points: ArrayLike) -> Floats:
         """Displacement of any reference points (n, 2) in mm, shape (n, 2), mm."""
+        ...
+
+
+class SpatialTissueModel(Protocol, Generic[State]):
+    """Tissue in space that answers a needle; states as in `TissueModel`."""
+
+    @property
+    def grid(self) -> SpatialGrid:
+        """The mesh; its corners are those of the tissue."""
+        ...
+
+    def rest(self) -> State:
+        """State of tissue that no needle has touched."""
+        ...
+
+    def advance(self, state: State, pose: SpatialPose, dt: float) -> State:
+        """State after the needle has moved to ``pose`` in ``dt`` seconds (dt >= 0)."""
+        ...
+
+    def field(self, state: State) -> Callable[[Floats], Floats]:
+        """Displacement (n, 3) in mm of any reference points (n, 3) in mm."""
         ...
