@@ -21,7 +21,7 @@ from echospline.mechanics.finite_elements import (
     point_loads,
     stiffness,
 )
-from echospline.mechanics.forces import NeedleForces, check_step, travelled
+from echospline.mechanics.forces import NeedleForces, ViscousForces, check_step, travelled
 from echospline.mechanics.landmarks import Clamps
 from echospline.scene import ZERO_LENGTH, Floats, NeedlePose, RegularGrid, Tissue
 
@@ -79,7 +79,7 @@ class FEMModel:
         grid: RegularGrid,
         clamped: Iterable[str] = ("left", "right", "bottom"),
         tissue: Tissue | None = None,
-        forces: NeedleForces | None = None,
+        forces: ViscousForces | None = None,
         *,
         clamped_points: ArrayLike | None = None,
         solver: Method = "cholmod",
@@ -87,7 +87,7 @@ class FEMModel:
     ) -> None:
         self._grid = grid
         self.tissue = tissue or Tissue()
-        self.forces = forces or NeedleForces()
+        self.forces = forces or ViscousForces()
         self.clamped = Clamps.of(grid, clamped, clamped_points).nodes
         young, poisson = self.tissue.in_cells(grid)
         if integration is None:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from echospline.errors import InputError
-from echospline.mechanics.forces import NeedleForces, check_step, travelled
+from echospline.mechanics.forces import NeedleForces, ViscousForces, check_step, travelled
 from echospline.mechanics.half_plane import GreensFunction
 from echospline.mechanics.landmarks import Clamps
 from echospline.scene import ZERO_LENGTH, Floats, NeedlePose, RegularGrid, Tissue
@@ -81,7 +81,7 @@ class GreenModel:
         grid: RegularGrid,
         clamped: Iterable[str] = ("left", "right", "bottom"),
         tissue: Tissue | None = None,
-        forces: NeedleForces | None = None,
+        forces: ViscousForces | None = None,
         *,
         clamped_points: ArrayLike | None = None,
         radius: float = 0.4,
@@ -90,7 +90,7 @@ class GreenModel:
     ) -> None:
         self._grid = grid
         self.tissue = tissue or Tissue()
-        self.forces = forces or NeedleForces()
+        self.forces = forces or ViscousForces()
         if not self.tissue.homogeneous:
             raise InputError(
                 "Green's function is that of homogeneous tissue; for tissue with regions use finite elements (fem)"
