@@ -2,7 +2,7 @@
 //
 // `level.cpp` is compiled once per level, with its own flags and its own namespace, because inline functions of the same name
 // would be merged by the linker and code for a better processor would run on a worse one. What crosses the border
-// are the two tables here. A handle keeps the table of its level, so nothing global is needed.
+// are the three tables here. A handle keeps the table of its level, so nothing global is needed.
 #pragma once
 #include <cstdint>
 
@@ -17,12 +17,14 @@ struct Message {
 
 struct TissueEntries;   // scenes and tissues: tissue_entries.hpp
 struct PictureEntries;  // pictures: picture_entries.hpp
+struct ForceEntries;    // tissue under a needle's forces: force_entries.hpp
 
 /// One level of the processor.
 struct Level {
   int32_t id;
   const TissueEntries* tissue;
   const PictureEntries* picture;
+  const ForceEntries* force;
 };
 
 /// Table of a level, or nullptr where the library does not hold it or the processor cannot run it. `ECHOSPLINE_LEVEL_BEST` is the best one.
