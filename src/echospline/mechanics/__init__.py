@@ -2,7 +2,8 @@
 
 from echospline.mechanics.anchored_kernel import AnchoredKernel
 from echospline.mechanics.fem import FEMModel
-from echospline.mechanics.forces import NeedleForces
+from echospline.mechanics.force_model import ForceModel
+from echospline.mechanics.forces import Forces, NeedleForces, NeedleLoad, ViscousForces
 from echospline.mechanics.green import GreenModel
 from echospline.mechanics.kernels import Elastic, Kernel, ThinPlate
 from echospline.mechanics.landmark_stiffness import landmark_stiffness
@@ -17,14 +18,18 @@ __all__ = [
     "Clamps",
     "Elastic",
     "FEMModel",
+    "ForceModel",
+    "Forces",
     "GreenModel",
     "Kernel",
     "NeedleForces",
+    "NeedleLoad",
     "Solver",
     "TPSModel",
     "TPSParameters",
     "ThinPlate",
     "TissueModel",
+    "ViscousForces",
     "describe_core",
     "landmark_stiffness",
 ]

@@ -10,20 +10,30 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from echospline.errors import InputError
-from echospline.mechanics.forces import NeedleForces, ViscousForces, check_step, travelled
-from echospline.mechanics.half_plane import GreensFunction
+from echospline.mechanics.force_model import ForceModel, ForceState
+from echospline.mechanics.forces import (
+    Forces,
+    NeedleForces,
+    NeedleLoad,
+    ViscousForces,
+    check_step,
+    travelled,
+)
+from echospline.mechanics.green_response import GreenResponse
 from echospline.mechanics.landmarks import Clamps
 from echospline.scene import ZERO_LENGTH, Floats, NeedlePose, RegularGrid, Tissue
 
 
 @dataclass(frozen=True)
 class GreenState:
-    """What the tissue remembers.
+    """What the tissue remembers under the viscous law.
 
     Attributes
     ----------
@@ -46,6 +56,9 @@ class GreenState:
     displacement: Floats
 
 
+State = GreenState | ForceState
+
+
 class GreenModel:
     """Homogeneous elastic tissue under a needle's forces, by superposition of point forces.
 
@@ -58,17 +71,19 @@ class GreenModel:
         edge that is not clamped.
     tissue : Tissue
         Homogeneous; E, nu, thickness, plane stress or strain.
-    forces : NeedleForces
-        What the needle exerts.
+    forces : NeedleForces or ViscousForces
+        What the needle exerts: the law that sticks and slips, or the paper's.
     clamped_points : array_like, shape (k, 2), optional
         Further anchors, mm.
+    sliding : iterable of the same edges
+        Edges along which the tissue slides.
     radius : float
         Over which a force is spread, mm; by default about the radius of an 18 gauge needle. The field near the
         tip depends on it, the field elsewhere does not.
     anchor_spacing : float
         Greatest distance between anchors, mm.
     station_spacing : float
-        Distance along the shaft between the points that carry friction, mm.
+        Of the viscous law: distance along the shaft between the points that carry friction, mm.
 
     Raises
     ------
@@ -81,74 +96,80 @@ class GreenModel:
         grid: RegularGrid,
         clamped: Iterable[str] = ("left", "right", "bottom"),
         tissue: Tissue | None = None,
-        forces: ViscousForces | None = None,
+        forces: Forces | None = None,
         *,
         clamped_points: ArrayLike | None = None,
+        sliding: Iterable[str] = (),
         radius: float = 0.4,
         anchor_spacing: float = 1.5,
         station_spacing: float = 1.0,
     ) -> None:
         self._grid = grid
-        self.tissue = tissue or Tissue()
-        self.forces = forces or ViscousForces()
-        if not self.tissue.homogeneous:
-            raise InputError(
-                "Green's function is that of homogeneous tissue; for tissue with regions use finite elements (fem)"
-            )
+        self.tissue, self.forces = tissue or Tissue(), forces or NeedleForces()
         if not (np.isfinite(station_spacing) and station_spacing > 0):
             raise InputError(f"station_spacing must be a positive number in mm; got {station_spacing}")
-        edges = tuple(clamped)
         self.station_spacing = station_spacing
-        self.green = GreensFunction(
-            Clamps.of(grid, edges, clamped_points).anchors(anchor_spacing),
-            self.tissue.young,
-            self.tissue.poisson,
-            self.tissue.thickness,
-            self.tissue.plane,
-            radius,
-            anchor_spacing / (2.0 * np.pi),
-            None if "top" in edges else grid.origin[1],
+        clamps = Clamps.of(grid, clamped, clamped_points, sliding)
+        self.response = GreenResponse(grid, clamps, self.tissue, radius=radius, spacing=anchor_spacing)
+        self.green = self.response.green
+        self.needle = (
+            ForceModel(self.response, self.forces) if isinstance(self.forces, NeedleForces) else None
         )
-        self._projector = self.green.projector(grid.nodes)
+        self._projector = self.response.projector
+        self._made = partial(
+            GreenModel, grid, clamps.edges, self.tissue, self.forces, clamped_points=clamps.points,
+            sliding=clamps.sliding, radius=radius, anchor_spacing=anchor_spacing, station_spacing=station_spacing,
+        )  # fmt: skip
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle what the model was made of."""
+        return self._made, ()
 
     @property
     def grid(self) -> RegularGrid:
         """The mesh."""
         return self._grid
 
-    def rest(self) -> GreenState:
+    def rest(self) -> State:
         """Tissue that no needle has touched."""
+        if self.needle is not None:
+            return self.needle.rest()
         n = self.grid.size
         return GreenState(None, 0.0, np.zeros(0), np.zeros((2 * n, 0)), np.zeros((n, 2)))
 
-    def advance(self, state: GreenState, pose: NeedlePose, dt: float) -> GreenState:
+    def advance(self, state: State, pose: NeedlePose, dt: float) -> State:
         """Forces of the new pose and the field under them.
 
         Raises
         ------
         InputError
-            If dt is negative or not finite.
+            If dt is negative or not finite, or the state is of the other law.
         """
         check_step(dt)
+        if self.needle is not None and isinstance(state, ForceState):
+            return self.needle.advance(state, pose, dt)
+        law = self.forces
+        if not isinstance(law, ViscousForces) or not isinstance(state, GreenState):
+            raise InputError("this state belongs to a model with the other law of forces")
         travel = travelled(state.pose, pose)
         inside = pose.depth >= ZERO_LENGTH and bool(self.grid.contains(pose.tip)[0])
-        tip = self.forces.advance_tip(state.tip, pose, travel, inside=inside)
+        tip = law.advance_tip(state.tip, pose, travel, inside=inside)
         columns, covered, ahead = self._columns(state, pose, push=tip != 0)
         before = np.zeros((columns.shape[1], 1))
         kept = min(len(state.friction), len(before))
         before[:kept, 0] = state.friction[:kept]
-        steady = np.full_like(before, self.forces.friction * pose.speed)
-        friction = self.forces.advance_friction(before, steady, travel, dt)[:, 0]
+        steady = np.full_like(before, law.friction * pose.speed)
+        friction = law.advance_friction(before, steady, travel, dt)[:, 0]
         field = columns @ (friction * covered)
         if ahead is not None:
             field = field + ahead * tip
         return GreenState(pose, tip, friction, columns, _vectors(field))
 
-    def displacement(self, state: GreenState) -> Floats:
+    def displacement(self, state: State) -> Floats:
         """Displacement of the nodes, shape (n, 2), mm."""
         return state.displacement
 
-    def displacement_at(self, state: GreenState, points: ArrayLike) -> Floats:
+    def displacement_at(self, state: State, points: ArrayLike) -> Floats:
         """Displacement of any reference points in the tissue, shape (n, 2), mm.
 
         Raises
@@ -156,6 +177,10 @@ class GreenModel:
         InputError
             If a point lies above the free surface.
         """
+        if isinstance(state, ForceState):
+            if self.needle is None:
+                raise InputError("this state belongs to a model with the other law of forces")
+            return self.needle.displacement_at(state, points)
         p = np.atleast_2d(np.asarray(points, dtype=np.float64))
         if state.pose is None or state.pose.depth < ZERO_LENGTH:
             return np.zeros(p.shape)
@@ -168,6 +193,14 @@ class GreenModel:
         axis = np.array(state.pose.axis)
         G = self.green.columns(p, sources)
         return _vectors(G @ np.concatenate([forces * axis[0], forces * axis[1]]))
+
+    def needle_load(self, state: State) -> NeedleLoad:
+        """Return the needle's forces on the tissue."""
+        if isinstance(state, ForceState):
+            return state.load
+        if state.pose is None:
+            return NeedleLoad()
+        return NeedleLoad(state.tip, float(state.friction @ self.stations(state.pose)[1]))
 
     def stations(self, pose: NeedlePose) -> tuple[Floats, Floats]:
         """Points (k, 2) of the shaft that carry friction, mm, and the length (k,) in mm that each stands for."""

@@ -15,7 +15,7 @@ class GreenResponse:
     """Homogeneous tissue by Green's function with anchors along what is clamped: a `ForceResponse`."""
 
     def __init__(
-        self, grid: RegularGrid, clamps: Clamps, tissue: Tissue, radius: float, spacing: float
+        self, grid: RegularGrid, clamps: Clamps, tissue: Tissue, *, radius: float, spacing: float
     ) -> None:
         if not tissue.homogeneous:
             raise InputError(
@@ -26,7 +26,7 @@ class GreenResponse:
             clamps.anchors(spacing), tissue.young, tissue.poisson, tissue.thickness, tissue.plane, radius,
             spacing / (2.0 * np.pi), None if "top" in clamps.edges else grid.origin[1],
         )  # fmt: skip
-        self._projector = self.green.projector(grid.nodes)
+        self.projector = self.green.projector(grid.nodes)
 
     @property
     def grid(self) -> RegularGrid:
@@ -36,7 +36,7 @@ class GreenResponse:
     def answer(self, places: Floats, forces: Floats, points: Floats) -> tuple[Floats, Floats]:
         """Displacement under k load cases of point forces; see `ForceResponse.answer`."""
         f = forces.transpose(1, 0, 2).reshape(2 * len(places), -1)
-        mesh = self.green.columns(self.grid.nodes, places, self._projector) @ f
+        mesh = self.green.columns(self.grid.nodes, places, self.projector) @ f
         at = self.green.columns(points, places) @ f if len(points) else np.zeros((0, f.shape[1]))
         return _vectors(mesh), _vectors(at)
 
@@ -49,7 +49,7 @@ def green_response(
     grid: RegularGrid, clamps: Clamps, tissue: Tissue, *, radius: float = 0.4, spacing: float = 1.5
 ) -> ForceResponse:
     """Build the response of tissue by Green's function."""
-    return GreenResponse(grid, clamps, tissue, radius, spacing)
+    return GreenResponse(grid, clamps, tissue, radius=radius, spacing=spacing)
 
 
 def _vectors(blocks: Floats) -> Floats:
