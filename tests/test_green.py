@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from echospline.errors import InputError
-from echospline.mechanics import FEMModel, GreenModel, NeedleForces
+from echospline.mechanics import FEMModel, GreenModel, ViscousForces
 from echospline.mechanics.half_plane import GreensFunction, fundamental
 from echospline.scene import Circle, Insertion, NeedlePose, Region, RegularGrid, Tissue
 
@@ -88,7 +88,7 @@ def test_clamped_response_is_symmetric_and_positive():
 )
 def test_green_agrees_with_finite_elements_without_any_fitting(entry, angle, depth, friction):
     """Same E, nu, thickness, forces: mean difference below 3 % of the mean displacement at every depth."""
-    forces = NeedleForces(0.4, friction, ramp=0.0)
+    forces = ViscousForces(0.4, friction, ramp=0.0)
     fem, green = FEMModel(GRID, BOX, forces=forces), GreenModel(GRID, BOX, forces=forces)
     insertion = Insertion.straight(entry, angle, depth)
     a, b = fem.rest(), green.rest()
@@ -103,7 +103,7 @@ def test_difference_to_finite_elements_falls_as_both_are_refined():
     differences = []
     for n, spacing in ((1, 2.0), (2, 1.0), (4, 0.5)):
         grid = RegularGrid((20 * n + 1, 15 * n + 1), (2.0 / n, 2.0 / n))
-        forces = NeedleForces(0.4, 0.0, ramp=0.0)
+        forces = ViscousForces(0.4, 0.0, ramp=0.0)
         fem = FEMModel(grid, BOX, forces=forces)
         green = GreenModel(grid, BOX, forces=forces, radius=0.2, anchor_spacing=spacing)
         away = np.hypot(*(grid.nodes - pose.tip).T) > 3.0
@@ -114,7 +114,7 @@ def test_difference_to_finite_elements_falls_as_both_are_refined():
 
 
 def test_field_at_nodes_is_the_field_at_points():
-    model = GreenModel(GRID, BOX, forces=NeedleForces(0.4, 1e-3))
+    model = GreenModel(GRID, BOX, forces=ViscousForces(0.4, 1e-3))
     state = model.rest()
     for t in (1.0, 2.0, 3.3):
         state = model.advance(state, Insertion.straight((12, 0), 60, 26).pose(t), 1.0)
@@ -136,7 +136,7 @@ def test_stations_carry_the_whole_shaft_and_its_moment(depth):
 
 
 def test_stations_kept_between_steps_change_nothing():
-    model = GreenModel(GRID, BOX, forces=NeedleForces(0.4, 1e-3, ramp=0.0))
+    model = GreenModel(GRID, BOX, forces=ViscousForces(0.4, 1e-3, ramp=0.0))
     insertion = Insertion.straight((12, 0), 60, 26)
     stepped = model.rest()
     for t in np.linspace(0.1, 5.0, 20):

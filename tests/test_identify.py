@@ -9,7 +9,7 @@ from echospline.mechanics import (
     Elastic,
     FEMModel,
     GreenModel,
-    NeedleForces,
+    ViscousForces,
     ThinPlate,
     TPSModel,
     TPSParameters,
@@ -50,7 +50,7 @@ def observe(model, insertion=PUSH, frames=12, noise=0.0, rest=0.0):
 
 @pytest.fixture(scope="module")
 def fem_truth():
-    return observe(FEMModel(GRID, forces=NeedleForces(0.4, 1e-4, ramp=0.0)))
+    return observe(FEMModel(GRID, forces=ViscousForces(0.4, 1e-4, ramp=0.0)))
 
 
 @pytest.mark.parametrize("kernel", [ThinPlate(), Elastic(0.45, 1.0)], ids=["thin plate", "elastic"])
@@ -67,7 +67,7 @@ def test_spline_fields_are_what_the_model_shows(kernel, solver):
 
 @pytest.mark.parametrize("make", [FEMModel, GreenModel])
 def test_force_fields_are_what_the_model_shows(make):
-    model = make(GRID, forces=NeedleForces(0.3, 2e-3, alpha3=0.8, ramp=0.0))
+    model = make(GRID, forces=ViscousForces(0.3, 2e-3, alpha3=0.8, ramp=0.0))
     seen = observe(model, Insertion.straight((12, 0), 60, 20, 5, dwell=2.0), rest=2.0)
     field = ForceFields(model, seen).fields({"alpha3": 0.8}) @ np.array([0.3, 2e-3])
     np.testing.assert_allclose(field, seen.displacement, atol=1e-9)
@@ -90,7 +90,7 @@ def test_spline_parameters_are_found_again(objective):
 
 
 def test_force_and_relaxation_are_found_again_in_noise():
-    model = FEMModel(GRID, forces=NeedleForces(0.3, 2e-3, alpha3=0.8, ramp=0.0))
+    model = FEMModel(GRID, forces=ViscousForces(0.3, 2e-3, alpha3=0.8, ramp=0.0))
     seen = observe(model, Insertion.straight((12, 0), 60, 20, 5, dwell=2.0), rest=2.0, noise=0.02)
     found = identify(ForceFields(model, seen), "rmse", bootstrap=100)
     assert found.values["tip"] == pytest.approx(0.3, rel=0.02)
@@ -135,7 +135,7 @@ def test_closed_form_is_no_worse_than_the_grid_and_needs_far_fewer_runs(fem_trut
 def test_parameters_that_the_data_cannot_tell_are_named(fem_truth):
     """With a band so thin that every contact is equally far, alpha1 and alpha2 act alike."""
     straight = observe(
-        FEMModel(GRID, forces=NeedleForces(0.4, 1e-4, ramp=0.0)), Insertion.straight((20, 0), 90, 20, 5)
+        FEMModel(GRID, forces=ViscousForces(0.4, 1e-4, ramp=0.0)), Insertion.straight((20, 0), 90, 20, 5)
     )
     found = identify(SplineFields(TPSModel(GRID, parameters=printed()), straight, delta=(0.5,)), bootstrap=0)
     assert found.condition > 30
@@ -143,7 +143,7 @@ def test_parameters_that_the_data_cannot_tell_are_named(fem_truth):
 
 
 def test_a_needle_at_rest_tells_nothing_of_friction(fem_truth):
-    still = FEMModel(GRID, forces=NeedleForces(0.4, 0.0, ramp=0.0))
+    still = FEMModel(GRID, forces=ViscousForces(0.4, 0.0, ramp=0.0))
     seen = observe(still)
     slow = Observation(
         seen.points, seen.displacement, seen.times, [type(p)(p.entry, p.tip, 0.0) for p in seen.poses]

@@ -70,7 +70,8 @@ echospline_status say(Message& message, echospline_status status) {
   if (status == ECHOSPLINE_OUT_OF_MEMORY) return refuse(message, status, "memory ran out; the state has not changed");
   if (status == ECHOSPLINE_NOT_SOLVED)
     return refuse(message, status,
-                  "the needle's forces could not be solved, and the state has not changed: the rows of the answers must be a symmetric "
+                  "the needle's forces could not be solved, and the state has not changed: the rows of the answers "
+                  "must be a symmetric "
                   "positive compliance in mm/N");
   if (status == ECHOSPLINE_NEEDS_STATION)
     return refuse(message, status, "the answer to a station is needed: ask echospline_forced_wanted which");
@@ -121,10 +122,9 @@ echospline_status echospline_forced_create(const echospline_forced_options* opti
   if (status != ECHOSPLINE_OK) return status;
   made.level = echospline::find_level(options->level);
   if (!made.level)
-    return refuse(made.message, ECHOSPLINE_WRONG_VALUE,
-                  "level must be one that this processor has, at most %s; got %d (%s)",
-                  echospline_level_name(echospline_level_best()), options->level,
-                  echospline_level_name(options->level));
+    return refuse(
+        made.message, ECHOSPLINE_WRONG_VALUE, "level must be one that this processor has, at most %s; got %d (%s)",
+        echospline_level_name(echospline_level_best()), options->level, echospline_level_name(options->level));
   made.nodes = options->node_count;
   made.self = made.level->force->create(*options);
   if (!made.self) return refuse(made.message, ECHOSPLINE_OUT_OF_MEMORY, "memory ran out while the tissue was built");
@@ -176,33 +176,35 @@ echospline_status echospline_forced_stations(echospline_forced* f, echospline_st
   const echospline_status status = usable(f);
   if (status != ECHOSPLINE_OK) return status;
   if (!count || (room > 0 && !stations))
-    return refuse(f->message, ECHOSPLINE_NULL_POINTER, "count, and stations where there is room, must be given; got NULL");
+    return refuse(f->message, ECHOSPLINE_NULL_POINTER,
+                  "count, and stations where there is room, must be given; got NULL");
   *count = f->level->force->stations(f->self, stations, room);
   return ECHOSPLINE_OK;
 }
 
-echospline_status echospline_forced_answer(echospline_forced* f, const float* columns, int64_t count, const double* rows,
-                                           int64_t row_count) {
+echospline_status echospline_forced_answer(echospline_forced* f, const float* columns, int64_t count,
+                                           const double* rows, int64_t row_count) {
   echospline_status status = usable(f);
   if (status != ECHOSPLINE_OK) return status;
   const int64_t index = f->level->force->wanted(f->self, nullptr);
   if (index < 0)
     return refuse(f->message, ECHOSPLINE_WRONG_VALUE,
                   "an answer is taken after a call has returned ECHOSPLINE_NEEDS_STATION; none is wanted now");
-  const bool outside = f->level->force->wanted_points(f->self) == 0 && !columns && count == 0;
+  const bool outside = f->level->force->wanted_points(f->self) == 0 && count == 0;
   if (!outside) {
     status = room_for(f->message, columns, count, 4 * f->nodes);
     if (status != ECHOSPLINE_OK) return status;
     for (int64_t i = 0; i < 4 * f->nodes; ++i)
       if (!(std::fabs(columns[i]) <= 1e9f))
         return refuse(f->message, ECHOSPLINE_WRONG_VALUE,
-                      "columns must be finite numbers in mm/N, below 1e9; number %lld is not", static_cast<long long>(i));
+                      "columns must be finite numbers in mm/N, below 1e9; number %lld is not",
+                      static_cast<long long>(i));
   }
   status = room_for(f->message, rows, row_count, 4 * (index + 1));
   if (status != ECHOSPLINE_OK) return status;
   if (!finite(rows, 4 * (index + 1)))
     return refuse(f->message, ECHOSPLINE_WRONG_VALUE, "rows must be finite numbers in mm/N, below 1e9");
-  return say(f->message, f->level->force->answer(f->self, columns, rows));
+  return say(f->message, f->level->force->answer(f->self, outside ? nullptr : columns, rows));
 }
 
 echospline_status echospline_forced_load(echospline_forced* f, echospline_needle_load* load) {
@@ -217,7 +219,8 @@ echospline_status echospline_forced_forces(echospline_forced* f, double* forces,
   const echospline_status status = usable(f);
   if (status != ECHOSPLINE_OK) return status;
   if (!count || (room > 0 && !forces))
-    return refuse(f->message, ECHOSPLINE_NULL_POINTER, "count, and forces where there is room, must be given; got NULL");
+    return refuse(f->message, ECHOSPLINE_NULL_POINTER,
+                  "count, and forces where there is room, must be given; got NULL");
   *count = f->level->force->forces(f->self, forces, forces ? room : -1);
   return ECHOSPLINE_OK;
 }
@@ -233,7 +236,8 @@ echospline_status echospline_forced_displacement_single(echospline_forced* f, fl
   echospline_status status = usable(f);
   if (status != ECHOSPLINE_OK) return status;
   status = room_for(f->message, displacement, count, 2 * f->nodes);
-  return status == ECHOSPLINE_OK ? say(f->message, f->level->force->displacement_single(f->self, displacement)) : status;
+  return status == ECHOSPLINE_OK ? say(f->message, f->level->force->displacement_single(f->self, displacement))
+                                 : status;
 }
 
 int64_t echospline_forced_state_size(const echospline_forced* f) {

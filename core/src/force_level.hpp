@@ -51,8 +51,16 @@ inline void describe(const SlipStation& s, int64_t index, echospline_station& ou
 }
 
 inline void* create_forced(const echospline_forced_options& o) {
-  const SlipLaw law = {o.tip,        o.friction_limit,  o.bond,    o.tip_stiffness, o.side_stiffness,
-                       o.viscosity,  o.station_spacing, o.substep, o.dead_band,     {o.low[0], o.low[1]},
+  const SlipLaw law = {o.tip,
+                       o.friction_limit,
+                       o.bond,
+                       o.tip_stiffness,
+                       o.side_stiffness,
+                       o.viscosity,
+                       o.station_spacing,
+                       o.substep,
+                       o.dead_band,
+                       {o.low[0], o.low[1]},
                        {o.high[0], o.high[1]}};
   SlipTissue* made = create<SlipTissue>(law, o.node_count);
   if (made && !made->build()) {
@@ -106,10 +114,10 @@ inline echospline_status load_slip(void* f, const void* bytes, int64_t size, Mes
   std::memcpy(&header, p, sizeof header);
   if (std::memcmp(header.magic, SLIP_MAGIC, sizeof header.magic) != 0)
     return refuse_slip(message, "these begin differently");
-  if (header.version != SLIP_VERSION)
-    return refuse_slip(message, "these are of another version: save the state again");
+  if (header.version != SLIP_VERSION) return refuse_slip(message, "these are of another version: save the state again");
   const int64_t count = header.count;
-  if (count < 0 || count == 1 || count > MOST_STATIONS || size != fixed + count * static_cast<int64_t>(sizeof(SlipSaved)))
+  if (count < 0 || count == 1 || count > MOST_STATIONS ||
+      size != fixed + count * static_cast<int64_t>(sizeof(SlipSaved)))
     return refuse_slip(message, "their number does not fit the stations that they announce");
   uint64_t sum;
   std::memcpy(&sum, p + size - sizeof sum, sizeof sum);

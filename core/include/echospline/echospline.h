@@ -377,25 +377,25 @@ ECHOSPLINE_API echospline_status echospline_picture_echo(echospline_picture* pic
 typedef struct echospline_forced_options {
   uint32_t struct_size;
   int32_t level;
-  int64_t node_count;      /* of the mesh whose displacement is wanted */
-  double low[2], high[2];  /* least and greatest corner of the tissue, mm */
-  double tip;              /* cutting force, N */
-  double friction_limit;   /* per mm of shaft, N/mm */
-  double bond;             /* stiffness between shaft and tissue per mm of shaft, N/mm^2 */
-  double tip_stiffness;    /* N/mm */
-  double side_stiffness;   /* across the shaft, per mm of shaft, N/mm^2 */
-  double viscosity;        /* friction beyond its limit per mm of shaft and mm/s of slip, N s/mm^2 */
-  double station_spacing;  /* mm */
-  double substep;          /* longest travel that is solved at once, mm */
-  double dead_band;        /* play in the depth to either side, mm */
+  int64_t node_count;     /* of the mesh whose displacement is wanted */
+  double low[2], high[2]; /* least and greatest corner of the tissue, mm */
+  double tip;             /* cutting force, N */
+  double friction_limit;  /* per mm of shaft, N/mm */
+  double bond;            /* stiffness between shaft and tissue per mm of shaft, N/mm^2 */
+  double tip_stiffness;   /* N/mm */
+  double side_stiffness;  /* across the shaft, per mm of shaft, N/mm^2 */
+  double viscosity;       /* friction beyond its limit per mm of shaft and mm/s of slip, N s/mm^2 */
+  double station_spacing; /* mm */
+  double substep;         /* longest travel that is solved at once, mm */
+  double dead_band;       /* play in the depth to either side, mm */
 } echospline_forced_options;
 
 typedef struct echospline_station {
-  int64_t index;     /* along the track, 0 at the surface */
-  double place[2];   /* in the undeformed tissue, mm */
-  double axis[2];    /* of the needle when the tip cut there */
-  double points[8];  /* (point_count, 2) mm: where the station's force acts */
-  double weights[4]; /* share of the force at each point; they add up to 1 */
+  int64_t index;       /* along the track, 0 at the surface */
+  double place[2];     /* in the undeformed tissue, mm */
+  double axis[2];      /* of the needle when the tip cut there */
+  double points[8];    /* (point_count, 2) mm: where the station's force acts */
+  double weights[4];   /* share of the force at each point; they add up to 1 */
   int32_t point_count; /* 0 to 4; 0: outside the tissue, its columns and rows are zero */
   int32_t reserved;
 } echospline_station;
@@ -431,8 +431,8 @@ ECHOSPLINE_API echospline_status echospline_forced_stations(echospline_forced* f
 /* Answer the wanted station. columns (2, node_count, 2): displacement of the nodes by a unit force along x, then along y, mm/N;
  * rows (index + 1, 2, 2): [station, component, direction of the force], mean displacement over the stations before it and, last, itself.
  * Where a station has no points columns may be NULL with count 0. Both are copied. */
-ECHOSPLINE_API echospline_status echospline_forced_answer(echospline_forced* forced, const float* columns, int64_t count,
-                                                          const double* rows, int64_t row_count);
+ECHOSPLINE_API echospline_status echospline_forced_answer(echospline_forced* forced, const float* columns,
+                                                          int64_t count, const double* rows, int64_t row_count);
 
 /* Forces of the present state. */
 ECHOSPLINE_API echospline_status echospline_forced_load(echospline_forced* forced, echospline_needle_load* load);

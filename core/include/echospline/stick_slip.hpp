@@ -16,18 +16,19 @@
 
 namespace echospline::ECHOSPLINE_CORE {
 
-constexpr int MOST_STATIONS = 512;          // of a track: 640 mm at the usual spacing
-constexpr int MOST_SUBSTEPS = 400;          // of a step; a needle that jumps further is solved in longer ones
-constexpr int MOST_REPEATS = 20;            // solutions of a substep, while front, cover and displacement come to agree
-constexpr double AGREED = 1e-7;             // mm; front and cover agree when they change by less
-constexpr double LEAST_CONTACT = 1e-9;      // mm; a piece that is covered less than this is not touched
-constexpr double RUN_AHEAD = 1.5;           // travels of the needle that the front may advance in a substep: see the Python file
-constexpr double SPRING_BACK = 1.0;         // travels of the needle that a station may spring back in a substep
-constexpr double SAME_AXIS = 1e-9;          // axes that differ by less are one axis
-constexpr double NO_LENGTH = 1e-9;          // mm; a shorter needle has no direction
-constexpr double PIVOT_ROUNDING = 1e-13;    // N or mm; bounds hold within it
-constexpr int MOST_GUESSES = 30;            // of the bounds that hold, before sweeps take over
-constexpr int MOST_SWEEPS = 20000;
+constexpr int MOST_STATIONS = 512;      // of a track: 640 mm at the usual spacing
+constexpr int MOST_SUBSTEPS = 400;      // of a step; a needle that jumps further is solved in longer ones
+constexpr int MOST_REPEATS = 20;        // solutions of a substep, while front, cover and displacement come to agree
+constexpr double AGREED = 1e-7;         // mm; front and cover agree when they change by less
+constexpr double LEAST_CONTACT = 1e-9;  // mm; a piece that is covered less than this is not touched
+constexpr double RUN_AHEAD = 1.5;  // travels of the needle that the front may advance in a substep: see the Python file
+constexpr double SPRING_BACK = 1.0;       // travels of the needle that a station may spring back in a substep
+constexpr double SAME_AXIS = 1e-9;        // axes that differ by less are one axis
+constexpr double NO_LENGTH = 1e-9;        // mm; a shorter needle has no direction
+constexpr double PIVOT_ROUNDING = 1e-13;  // N or mm; bounds hold within it
+constexpr int MOST_GUESSES = 30;          // of the bounds that hold, before they change one at a time
+constexpr int MOST_CHANGES = 20;          // one at a time, per unknown
+constexpr int MOST_SWEEPS = 2000;         // if rounding keeps those from ending
 
 /// Parameters of the law; units as in `echospline_force_options`.
 struct SlipLaw {
@@ -81,7 +82,11 @@ class BoxProgramme {
   bool solve() {
     for (int guess = 0; guess < MOST_GUESSES; ++guess) {
       if (!with_bounds()) return false;
-      if (!correct()) return true;
+      if (!correct(false)) return true;
+    }
+    for (int64_t change = 0; change < MOST_CHANGES * n_; ++change) {
+      if (!with_bounds()) return false;
+      if (!correct(true)) return true;
     }
     return sweep();
   }
@@ -135,8 +140,8 @@ class BoxProgramme {
     return true;
   }
 
-  /// Correct the guess by the solution; false when it was right.
-  bool correct() {
+  /// Correct the guess by the solution, all of it or only the first bound that is wrong (which ends: Murty 1974); false when it was right.
+  bool correct(bool first_alone) {
     bool changed = false;
     for (int64_t i = 0; i < n_; ++i) {
       int32_t next = 0;
@@ -151,6 +156,10 @@ class BoxProgramme {
           pull = z[i] - bound(i);
         }
         if (held[i] > 0 ? pull > -PIVOT_ROUNDING : pull < PIVOT_ROUNDING) next = held[i];
+      }
+      if (next != held[i] && first_alone) {
+        held[i] = next;
+        return true;
       }
       if (next != held[i]) changed = true;
       index_[i] = next;
@@ -202,9 +211,7 @@ struct SlipState {
     depth = other.depth, push = other.push, cut = other.cut, count = other.count;
     for (int64_t j = 0; j < count; ++j) contacts[j] = other.contacts[j];
   }
-  void clear() {
-    directed = false, tip = axis = entry = {}, depth = push = cut = 0, count = 0;
-  }
+  void clear() { directed = false, tip = axis = entry = {}, depth = push = cut = 0, count = 0; }
 };
 
 inline Vec<2> normal_of(const Vec<2>& a) { return {{-a[1], a[0]}}; }
@@ -241,26 +248,29 @@ class SlipTissue {
     if (missing != done) return wait(missing, entry, tip, pose.dt);
     const Vec<2> along = tip - entry;
     const double depth = norm(along);
-    if (depth < NO_LENGTH && !state.directed) {  // no direction yet
-      state.tip = tip, state.entry = entry;
+    if (depth < NO_LENGTH) {  // it has no direction and touches nothing
+      release(state);
+      state.tip = tip, state.entry = entry, state.depth = 0;
       return done;
     }
-    Vec<2> axis = depth < NO_LENGTH ? state.axis : (1 / depth) * along;
-    const bool straight = !state.directed || (std::fabs(axis[0] - state.axis[0]) < SAME_AXIS &&
-                                              std::fabs(axis[1] - state.axis[1]) < SAME_AXIS);
-    if (straight && state.directed) axis = state.axis;
-    const Vec<2> from = state.directed ? state.tip : entry, axis0 = state.directed ? state.axis : axis;
-    const double depth0 = state.directed ? state.depth : 0;
-    if (!state.directed) work_.directed = true;
-    if (!state.directed && next_ == 1) work_.axis = axis, work_.tip = entry, work_.depth = 0;
+    Vec<2> axis = (1 / depth) * along;
+    const bool anew = !state.directed || dot(state.axis, axis) < 0;  // the first, or drawn out and turned
+    const bool straight =
+        anew || (std::fabs(axis[0] - state.axis[0]) < SAME_AXIS && std::fabs(axis[1] - state.axis[1]) < SAME_AXIS);
+    if (straight && !anew) axis = state.axis;
+    const Vec<2> from = anew ? entry : state.tip, axis0 = anew ? axis : state.axis;
+    const double depth0 = anew ? 0 : state.depth;
+    if (anew && next_ == 1) {
+      release(work_);
+      work_.directed = true, work_.axis = axis, work_.tip = entry, work_.depth = 0;
+    }
     const double ahead = dot(tip - from, axis);
     const double held = ahead > law.dead_band ? law.dead_band : ahead < -law.dead_band ? -law.dead_band : ahead;
     const Vec<2> acting = tip - held * axis;
     double length = 0;
-    if (state.count > 0)
+    if (state.count > 0 && !anew)
       length = std::fmax(0.0, dot(from - state.contacts[0].place - state.contacts[0].moved, axis0));
-    const double travel =
-        std::fmax(norm(acting - from), norm(acting - length * axis - from + length * axis0));
+    const double travel = std::fmax(norm(acting - from), norm(acting - length * axis - from + length * axis0));
     const double parts = std::ceil(travel / law.substep - 1e-9);
     const int64_t count = parts > MOST_SUBSTEPS ? MOST_SUBSTEPS : parts > 1 ? static_cast<int64_t>(parts) : 1;
     const double start = std::atan2(axis0[1], axis0[0]), pi = 3.14159265358979323846;
@@ -329,8 +339,7 @@ class SlipTissue {
       }
       if (stations_[j].count == 0) continue;
       for (int d = 0; d < 2; ++d)
-        if (f[d] != 0)
-          factor_[used] = static_cast<float>(f[d]), column_[used++] = columns_[j].data() + d * 2 * nodes;
+        if (f[d] != 0) factor_[used] = static_cast<float>(f[d]), column_[used++] = columns_[j].data() + d * 2 * nodes;
     }
     for (int64_t begin = 0; begin < 2 * nodes; begin += BLOCK) {
       const int64_t size = begin + BLOCK < 2 * nodes ? BLOCK : 2 * nodes - begin;
@@ -395,6 +404,14 @@ class SlipTissue {
     return true;
   }
 
+  static void release(SlipState& s) {
+    s.push = 0;
+    for (int64_t j = 0; j < s.count; ++j) {
+      SlipContact& contact = s.contacts[j];
+      contact = {contact.place, contact.axis, 0, 0, 0, {}};
+    }
+  }
+
   Outcome wait(Outcome outcome, const Vec<2>& entry, const Vec<2>& tip, double dt) {
     pending_ = outcome == needs_station;
     pending_entry_ = entry, pending_tip_ = tip, pending_dt_ = dt;
@@ -413,8 +430,7 @@ class SlipTissue {
   /// Whether every station of a state has its answer; else asks for the first that has none.
   Outcome answered(const SlipState& s) {
     for (int64_t j = 0; j < s.count; ++j)
-      if (!matches(j, s.contacts[j].place, s.contacts[j].axis))
-        return want(j, s.contacts[j].place, s.contacts[j].axis);
+      if (!matches(j, s.contacts[j].place, s.contacts[j].axis)) return want(j, s.contacts[j].place, s.contacts[j].axis);
     return done;
   }
 

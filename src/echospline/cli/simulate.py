@@ -107,6 +107,11 @@ def _print_summary(report: dict[str, Any], out: Path) -> None:
         f"largest displacement {report['largest_displacement_mm']:.2f} mm, "
         f"inverse map within {report['inverse_map_residual_px']:.1e} px"
     )
+    if forces := report.get("largest_forces"):
+        console.print(
+            f"largest tip force {forces['tip_force_N']:.3f} N, friction {forces['friction_N']:.3f} N, "
+            f"side force {forces['side_force_N']:.3f} N"
+        )
     for fold in report["folded_frames"][:1]:
         console.print(
             f"[yellow]{len(report['folded_frames'])} frames fold, first at {fold['time_s']} s: {fold['what']}[/]"

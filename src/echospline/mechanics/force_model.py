@@ -176,7 +176,7 @@ class ForceModel:
         forces = np.vstack([s.weights[:, None] * f for s, f in loaded])
         return self.response.answer(places, forces[..., None], wanted)[1][..., 0]
 
-    def forces(self, state: ForceState) -> NeedleLoad:
+    def needle_load(self, state: ForceState) -> NeedleLoad:
         """Return the needle's forces on the tissue."""
         return state.load
 

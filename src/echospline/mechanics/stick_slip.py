@@ -46,6 +46,16 @@ SPRING_BACK = 1.0
 less the deeper the tip is. Without the two bounds the front jumps there, and tissue moves many times as far as the needle."""
 
 
+MOST_GUESSES = 30
+"""Of the bounds that hold, before they change one at a time."""
+MOST_CHANGES = 20
+"""One at a time, per unknown."""
+MOST_SWEEPS = 2_000
+"""If rounding keeps those from ending."""
+ROUNDING = 1e-13
+"""N or mm; bounds hold within it."""
+
+
 @dataclass(frozen=True)
 class Station:
     """One material point of the track, and its load.
@@ -179,9 +189,7 @@ def load(state: SlipState, spacing: float, pose: NeedlePose) -> NeedleLoad:
     f = station_forces(state, spacing)
     arm = state.track.places + state.moved - np.asarray(pose.entry)
     torque = float(np.sum(arm[:, 0] * f[:, 1] - arm[:, 1] * f[:, 0]))
-    return NeedleLoad(
-        state.push, float(state.friction.sum()), float(state.side.sum()), torque, state.cut
-    )
+    return NeedleLoad(state.push, float(state.friction.sum()), float(state.side.sum()), torque, state.cut)
 
 
 def advance(
@@ -195,10 +203,12 @@ def advance(
     """State after the needle has moved to a pose in dt seconds, in substeps."""
     axis, depth = _axis(state, pose), pose.depth
     tip = np.asarray(pose.tip, dtype=np.float64)
-    if axis is None:  # a needle without length, and none before: it has no direction yet
-        return replace(state, tip=tip)
-    if state.axis is None:
-        state = replace(state, axis=axis, tip=np.asarray(pose.entry, dtype=np.float64), depth=0.0)
+    if axis is None or depth < ZERO_LENGTH:  # it has no direction and touches nothing
+        return replace(_released(state), tip=tip, depth=0.0)
+    if state.axis is None or state.axis @ axis < 0:  # the first, or drawn out and turned
+        state = replace(
+            _released(state), axis=axis, tip=np.asarray(pose.entry, dtype=np.float64), depth=0.0
+        )
     assert state.axis is not None
     acting = _play(state.tip, tip, axis, law.dead_band)
     length = _length_inside(state)
@@ -218,6 +228,12 @@ def advance(
             law, extent, supply,
         )  # fmt: skip
     return state
+
+
+def _released(state: SlipState) -> SlipState:
+    """Let go of the tissue; track and cut front stay."""
+    none = np.zeros(len(state.track))
+    return replace(state, friction=none, side=none, covered=none, moved=np.zeros((len(none), 2)), push=0.0)
 
 
 def _axis(state: SlipState, pose: NeedlePose) -> Floats | None:
@@ -263,7 +279,7 @@ def _covered(eta: Floats, cut: float, track: Track, h: float) -> Floats:
     before = np.array([s.before for s in track.stations]) * h
     share = np.array([s.share for s in track.stations]) * h
     reach = np.minimum(eta, cut - h * np.arange(len(track)))
-    covered = np.clip(reach + h / 2 - before, 0.0, share)
+    covered: Floats = np.clip(reach + h / 2 - before, 0.0, share)
     covered[covered < LEAST_CONTACT] = 0.0
     return covered
 
@@ -347,69 +363,99 @@ def _grown(
     )
 
 
+@dataclass(frozen=True)
+class _Motion:
+    """What a substep is to the stations: compliances in the needle's frame, and motions with the tissue undeformed."""
+
+    along: Floats
+    across: Floats
+    mixed: Floats  # displacement along the axis at i by a force across it at j
+    eta: Floats
+    eta_gained: Floats  # over eta before the substep, in tissue that had moved
+    gap_gained: Floats
+
+    @classmethod
+    def of(cls, state: SlipState, tip: Floats, axis: Floats) -> _Motion:
+        assert state.axis is not None
+        C, X, n = state.track.compliance, state.track.places, _normal(axis)
+        before = state.tip - X - state.moved
+        return cls(
+            np.einsum("icjd,c,d->ij", C, axis, axis),
+            np.einsum("icjd,c,d->ij", C, n, n),
+            np.einsum("icjd,c,d->ij", C, axis, n),
+            (tip - X) @ axis,
+            (tip - X) @ axis - before @ state.axis,
+            (tip - X) @ n - before @ _normal(state.axis),
+        )
+
+
 def _solve(
     state: SlipState, tip: Floats, axis: Floats, depth: float, travel: float, dt: float, law: NeedleForces
 ) -> SlipState:
     """Forces, displacement and cut front of one substep, solved until all three agree."""
-    assert state.axis is not None
     h, track = law.station_spacing, state.track
-    k, X, n = len(track), track.places, _normal(axis)
-    C = track.compliance
-    along = np.einsum("icjd,c,d->ij", C, axis, axis)
-    across = np.einsum("icjd,c,d->ij", C, n, n)
-    mixed = np.einsum("icjd,c,d->ij", C, axis, n)
-    away = tip - X
-    eta_free, gap_free = away @ axis, away @ n  # with the tissue undeformed
-    before = state.tip - X - state.moved
-    eta_before, gap_before = before @ state.axis, before @ _normal(state.axis)
+    motion = _Motion.of(state, tip, axis)
     exists = np.array([s.share > 0 for s in track.stations], dtype=np.float64)
-    furthest = min(state.cut + RUN_AHEAD * travel, (k - 1) * h)
+    furthest = min(state.cut + RUN_AHEAD * travel, (len(track) - 1) * h)
     cut, moved = state.cut, state.moved
     pairs: list[tuple[float, float]] = []  # fronts tried, and how far each lagged behind
     for _ in range(MOST_REPEATS):
-        w = _covered(eta_free - moved @ axis, cut, track, h)
-        on = np.flatnonzero(w > 0)
-        m, weights = len(on), _front(cut, k, h)
+        w, weights = _covered(motion.eta - moved @ axis, cut, track, h), _front(cut, len(track), h)
         touch = float(weights @ exists)
-        kept = np.minimum(1.0, w[on] / np.where(state.covered[on] > 0, state.covered[on], np.inf))
-        F0, G0 = kept * state.friction[on], kept * state.side[on]
-        bond, firm = law.bond * w[on], law.side_stiffness * w[on]
-        limit = law.friction_limit * w[on]
-        t = weights[:, None]
-        M = np.block([
-            [along[np.ix_(on, on)], mixed[np.ix_(on, on)], (along @ t)[on]],
-            [mixed.T[np.ix_(on, on)], across[np.ix_(on, on)], (mixed.T @ t)[on]],
-            [(t.T @ along)[:, on], (t.T @ mixed)[:, on], t.T @ along @ t],
-        ])  # fmt: skip
-        pressing = law.tip_stiffness * touch
-        A = M + np.diag(np.r_[1 / bond, 1 / firm, 1 / pressing if touch > 0 else 1.0])
-        b = np.r_[F0 / bond + eta_free[on] - eta_before[on], G0 / firm + gap_free[on] - gap_before[on],
-                  weights @ eta_free]  # fmt: skip
-        low = np.r_[-limit, np.full(m, -np.inf), 0.0]
-        high = np.r_[limit, np.full(m, np.inf), law.tip * touch]
-        soft = np.zeros(2 * m + 1)
-        if law.viscosity > 0:
-            soft[:m] = dt / (law.viscosity * w[on])
-        z = solve_box(A, b, low, high, soft)
-        F, G = np.zeros(k), np.zeros(k)
-        F[on], G[on], T = z[:m], z[m : 2 * m], float(z[-1])
-        f = np.outer(F + weights * T, axis) + np.outer(G, n)
-        moved = np.einsum("icjd,jd->ic", C, f)
-        eta = eta_free - moved @ axis
+        F, G, T = _forces(state, motion, w, weights, touch, dt, law)
+        f = np.outer(F + weights * T, axis) + np.outer(G, _normal(axis))
+        moved = np.einsum("icjd,jd->ic", track.compliance, f)
+        eta = motion.eta - moved @ axis
         back = float(((state.moved - moved) @ axis).max())
         if cut > state.cut and back > SPRING_BACK * travel:  # cut less far
             furthest = state.cut + (cut - state.cut) * SPRING_BACK * travel / back
-        lag = float(weights @ eta) - law.tip / law.tip_stiffness if touch > 0 else float(weights @ eta)
+        lag = float(weights @ eta) - (law.tip / law.tip_stiffness if touch > 0 else 0.0)
         pairs.append((cut, lag))
         front = _next_front(pairs, state.cut, furthest)
         settled = np.abs(_covered(eta, front, track, h) - w).max() < AGREED
         if settled and abs(front - cut) < AGREED:
             break
         cut = front
-    cut = pairs[-1][0]
     return replace(
-        state, tip=tip, axis=axis, depth=depth, friction=F, side=G, covered=w, moved=moved, push=T, cut=cut
-    )
+        state, tip=tip, axis=axis, depth=depth, friction=F, side=G, covered=w, moved=moved, push=T,
+        cut=pairs[-1][0],
+    )  # fmt: skip
+
+
+def _forces(
+    state: SlipState,
+    motion: _Motion,
+    w: Floats,
+    weights: Floats,
+    touch: float,
+    dt: float,
+    law: NeedleForces,
+) -> tuple[Floats, Floats, float]:
+    """F, G and T for covered lengths w and a tip between the stations of these weights, ``touch`` of it in the tissue."""
+    on = np.flatnonzero(w > 0)
+    m, here, t = len(on), np.ix_(on, on), weights[:, None]
+    kept = np.minimum(1.0, w[on] / np.where(state.covered[on] > 0, state.covered[on], np.inf))
+    bond, firm, limit = law.bond * w[on], law.side_stiffness * w[on], law.friction_limit * w[on]
+    pressing = law.tip_stiffness * touch if touch > 0 else 1.0
+    A = np.block([
+        [motion.along[here], motion.mixed[here], (motion.along @ t)[on]],
+        [motion.mixed.T[here], motion.across[here], (motion.mixed.T @ t)[on]],
+        [(t.T @ motion.along)[:, on], (t.T @ motion.mixed)[:, on], t.T @ motion.along @ t],
+    ])  # fmt: skip
+    A += np.diag(np.r_[1 / bond, 1 / firm, 1 / pressing])
+    b = np.r_[
+        kept * state.friction[on] / bond + motion.eta_gained[on],
+        kept * state.side[on] / firm + motion.gap_gained[on],
+        weights @ motion.eta,
+    ]
+    free = np.full(m, np.inf)
+    soft = np.zeros(2 * m + 1)
+    if law.viscosity > 0:
+        soft[:m] = dt / (law.viscosity * w[on])
+    z = solve_box(A, b, np.r_[-limit, -free, 0.0], np.r_[limit, free, law.tip * touch], soft)
+    F, G = np.zeros(len(w)), np.zeros(len(w))
+    F[on], G[on] = z[:m], z[m : 2 * m]
+    return F, G, float(z[-1])
 
 
 def _next_front(pairs: list[tuple[float, float]], least: float, most: float) -> float:
@@ -438,21 +484,22 @@ def solve_box(A: Floats, b: Floats, low: Floats, high: Floats, soft: Floats) -> 
     Returns
     -------
     ndarray, shape (n,)
-        The one minimum: found by guessing which bounds hold and correcting the guess (a Newton method, two or three systems), and
-        where that comes back to an earlier guess by Gauss-Seidel sweeps, which always converge.
+        The one minimum: found by guessing which bounds hold and correcting the guess (a Newton method, two or three systems).
+        Should that come back to an earlier guess, the first wrong bound alone is corrected, which ends (Murty 1974); and
+        should rounding prevent even that, Gauss-Seidel sweeps converge.
     """
     held = np.zeros(len(b), dtype=np.int8)
-    for _ in range(MOST_GUESSES):
+    for attempt in range(MOST_GUESSES + MOST_CHANGES * len(b)):
         z = _with_bounds(A, b, low, high, soft, held)
         guess = _bounds_held(A, b, low, high, soft, held, z)
-        if (guess == held).all():
+        wrong = np.flatnonzero(guess != held)
+        if not len(wrong):
             return z
-        held = guess
+        if attempt < MOST_GUESSES:
+            held = guess
+        else:
+            held[wrong[0]] = guess[wrong[0]]
     return _sweeps(A, b, low, high, soft)
-
-
-MOST_GUESSES = 30
-MOST_SWEEPS = 100_000
 
 
 def _with_bounds(
@@ -480,9 +527,6 @@ def _bounds_held(
     guess[(held > 0) & np.where(rigid, pull > -ROUNDING, z > high - ROUNDING)] = 1
     guess[(held < 0) & np.where(rigid, pull < ROUNDING, z < low + ROUNDING)] = -1
     return guess
-
-
-ROUNDING = 1e-13
 
 
 def _sweeps(A: Floats, b: Floats, low: Floats, high: Floats, soft: Floats) -> Floats:

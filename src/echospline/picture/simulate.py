@@ -9,7 +9,7 @@ from time import perf_counter
 from typing import Literal
 
 from echospline.errors import FoldingError, InputError
-from echospline.mechanics.protocol import State, TissueModel
+from echospline.mechanics.protocol import NeedleLoad, State, TissueModel, needle_load
 from echospline.picture.deformation import Folds
 from echospline.picture.drawing import Drawing, ImageFormer
 from echospline.picture.native import Border, Inverse
@@ -39,6 +39,8 @@ class Frame:
         Where the deformation folds.
     milliseconds : dict
         Time spent per stage: interaction, spline, picture (deformation, check, sampling and needle).
+    load : NeedleLoad or None
+        The needle's forces; None where the model has none.
     """
 
     index: int
@@ -49,6 +51,7 @@ class Frame:
     residual: float = 0.0
     folds: Folds | None = None
     milliseconds: dict[str, float] = field(default_factory=dict)
+    load: NeedleLoad | None = None
 
 
 def frame_count(insertion: Insertion, fps: float) -> int:
@@ -138,7 +141,10 @@ def simulate(
         except FoldingError as error:
             raise FoldingError(f"at {index / fps:.2f} s {error}") from None
         clock.stage("picture")
-        yield Frame(index, index / fps, pose, u, drawn.image, drawn.residual, drawn.folds, clock.milliseconds)
+        load = needle_load(model, state)
+        yield Frame(
+            index, index / fps, pose, u, drawn.image, drawn.residual, drawn.folds, clock.milliseconds, load
+        )
 
 
 class _Stopwatch:

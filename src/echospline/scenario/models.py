@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -10,16 +11,19 @@ from echospline.mechanics import (
     Clamps,
     Elastic,
     FEMModel,
+    Forces,
     GreenModel,
     Kernel,
     NeedleForces,
     ThinPlate,
     TPSModel,
     TPSParameters,
+    ViscousForces,
     landmark_stiffness,
 )
 from echospline.mechanics.protocol import TissueModel
 from echospline.scenario.scenario import Scenario
+from echospline.scenario.sections import ForceSection
 from echospline.scene import RegularGrid
 
 MODELS = ("tps", "elastic", "green", "fem")
@@ -50,7 +54,7 @@ def build_model(
     tissue = scenario.make_tissue(folder or Path(), grid)
     clamped, points = scenario.mesh.clamped, scenario.mesh.clamped_points
     if kind in ("fem", "green"):
-        forces = NeedleForces(**scenario.model.forces.model_dump())
+        forces = _forces(scenario.model.forces)
         if kind == "fem":
             return FEMModel(grid, clamped, tissue, forces, clamped_points=points)
         radius = scenario.model.green.radius
@@ -66,3 +70,9 @@ def build_model(
         stiffness = None if tissue.homogeneous else landmark_stiffness(tissue, grid, kernel, anchors)
         return TPSModel(grid, clamped, parameters, kernel, clamped_points=points, stiffness=stiffness)
     raise InputError(f"a model is one of {', '.join(MODELS)}; got {kind!r}")
+
+
+def _forces(section: ForceSection) -> Forces:
+    """Build the law of forces that a scenario names."""
+    law = ViscousForces if section.law == "viscous" else NeedleForces
+    return law(**section.model_dump(include={parameter.name for parameter in fields(law)}))

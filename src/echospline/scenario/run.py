@@ -21,7 +21,7 @@ from echospline.errors import InputError
 from echospline.io import DisplacementWriter, open_writer
 from echospline.io.sequence import SequenceWriter
 from echospline.mechanics import describe_core
-from echospline.mechanics.protocol import State, TissueModel
+from echospline.mechanics.protocol import NeedleLoad, State, TissueModel
 from echospline.picture import Frame, ImageFormer, frame_count, simulate
 from echospline.scenario.scenario import Scenario
 from echospline.scene import UltrasoundImage
@@ -42,14 +42,30 @@ class _Tally:
     largest: float = 0.0
     residual: float = 0.0
     folded: list[dict[str, Any]] = field(default_factory=list)
+    forces: dict[str, float] = field(default_factory=dict)
 
     def add(self, frame: Frame) -> None:
         for name, ms in frame.milliseconds.items():
             self.stages.setdefault(name, []).append(ms)
         self.largest = max(self.largest, float(np.hypot(*frame.displacement.T).max(initial=0.0)))
         self.residual = max(self.residual, frame.residual)
+        for name, value in _forces(frame.load).items():
+            self.forces[name] = max(self.forces.get(name, 0.0), abs(value))
         if frame.folds:
             self.folded.append({"time_s": round(frame.time, 6), "what": str(frame.folds)})
+
+
+def _forces(load: NeedleLoad | None) -> dict[str, float]:
+    """Return the needle's forces with their units in their names, as they are recorded."""
+    if load is None:
+        return {}
+    return {
+        "tip_force_N": load.tip,
+        "friction_N": load.friction,
+        "side_force_N": load.side,
+        "torque_N_mm": load.torque,
+        "cut_mm": load.cut,
+    }
 
 
 def _sink(
@@ -138,7 +154,7 @@ def run(
             for sink in sinks:
                 sink(frame)
             if record is not None:
-                record.add(frame.displacement, frame.time, frame.pose)
+                record.add(frame.displacement, frame.time, frame.pose, _forces(frame.load))
             frame.milliseconds["write"] = 1000 * (perf_counter() - since)
             tally.add(frame)
             first = first or frame
@@ -174,6 +190,7 @@ def run(
         "mesh_nodes": model.grid.size,
         "frames": count,
         "largest_displacement_mm": tally.largest,
+        **({"largest_forces": tally.forces} if tally.forces else {}),
         "inverse_map_residual_px": tally.residual,
         "folded_frames": tally.folded,
         "milliseconds_per_frame": {

@@ -23,6 +23,7 @@ from echospline.scenario.messages import describe as _describe
 from echospline.scenario.messages import sentence, shown
 from echospline.scenario.phantom_section import PhantomSection, ProbeSection
 from echospline.scenario.sections import (
+    VISCOUS,
     ExerciseSection,
     ImageSection,
     MeshSection,
@@ -84,6 +85,12 @@ class Scenario(Section):
             for name in tables:
                 table = table[name]
             table[last] = value
+        old = [key for key in values if key.startswith("model.forces.") and key.split(".")[-1] in VISCOUS]
+        if old and tree["model"]["forces"]["law"] == "stick-slip":
+            raise InputError(
+                f'{old[0]} belongs to the viscous law of forces; this scenario\'s model.forces.law is "stick-slip": set it to '
+                '"viscous" too, or set friction_limit'
+            )
         return validated(tree, origin)
 
     def read_image(self, folder: Path) -> UltrasoundImage:

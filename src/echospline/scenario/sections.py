@@ -37,6 +37,8 @@ Speed = Annotated[float, _in_unit("mm/s")]
 Rate = Annotated[float, _in_unit("1/s")]
 Newtons = Annotated[float, _in_unit("N")]
 Friction = Annotated[float, _in_unit("N s/mm^2")]
+PerLength = Annotated[float, _in_unit("N/mm")]
+PerArea = Annotated[float, _in_unit("N/mm^2")]
 Kilopascals = Annotated[float, _in_unit("kPa")]
 Point = tuple[Millimetres, Millimetres]
 
@@ -227,16 +229,68 @@ class GreenSection(Section):
 
 
 class ForceSection(Section):
-    """The needle's forces for fem and green."""
+    """The needle's forces for fem and green: a law that sticks and slips, or the paper's viscous one."""
 
-    tip: Newtons = Field(0.4, ge=0, le=100, description="cutting force at the tip, N")
+    law: Literal["stick-slip", "viscous"] = Field(
+        "stick-slip",
+        description="stick-slip (sticks, slips, cuts) or viscous (paper), which reads tip, friction, alpha3 and ramp alone",
+    )
+    tip: Newtons = Field(0.4, ge=0, le=100, description="cutting force at the tip, N (paper)")
+    friction_limit: PerLength = Field(
+        0.01,
+        ge=0,
+        le=10,
+        description="greatest friction per mm of shaft, N/mm; 0.005 to 0.02 are plausible (assumed)",
+    )
+    bond: PerArea = Field(
+        0.1, gt=0, le=1e3, description="stiffness between shaft and tissue per mm, N/mm^2 (assumed)"
+    )
+    tip_stiffness: PerLength = Field(
+        2.0, gt=0, le=1e3, description="stiffness of the tip's contact, N/mm (assumed)"
+    )
+    side_stiffness: PerArea = Field(
+        1.0, gt=0, le=1e3, description="stiffness across the shaft per mm, N/mm^2 (assumed)"
+    )
+    viscosity: Friction = Field(
+        0.0,
+        ge=0,
+        le=10,
+        description="friction beyond its limit per mm and mm/s of slip, N s/mm^2; 5e-4 shows speed (assumed)",
+    )
+    station_spacing: Millimetres = Field(
+        1.25, ge=0.05, le=50, description="between the points of the track that carry forces, mm"
+    )
+    substep: Millimetres = Field(
+        0.25, ge=0.001, le=50, description="longest travel that is solved at once, mm"
+    )
+    dead_band: Millimetres = Field(
+        0.0,
+        ge=0,
+        le=10,
+        description="play in the depth to either side, mm; 0.15 suits a tracker with 0.05 mm of noise",
+    )
     friction: Friction = Field(
-        1e-3, ge=0, le=10, description="friction per mm of shaft and mm/s of speed, N s/mm^2 (paper: 1e-8)"
+        1e-3,
+        ge=0,
+        le=10,
+        description="viscous: friction per mm of shaft and mm/s of speed, N s/mm^2 (paper: 1e-8)",
     )
-    alpha3: Rate = Field(1.0, ge=0, le=1e3, description="relaxation (16), 1/s")
+    alpha3: Rate = Field(1.0, ge=0, le=1e3, description="viscous: relaxation (16), 1/s")
     ramp: Millimetres = Field(
-        1.0, ge=0, le=100, description="travel over which forces build up, mm; 0 at once"
+        1.0, ge=0, le=100, description="viscous: travel over which forces build up, mm; 0 at once"
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_old_files(cls, given: Any) -> Any:
+        """Numbers of the viscous law without a law: a file from before there were two."""
+        if isinstance(given, dict) and "law" not in given and VISCOUS.intersection(given):
+            return {**given, "law": "viscous"}
+        return given
+
+
+VISCOUS = frozenset({"friction", "alpha3", "ramp"})
+"""Keys of [model.forces] that the viscous law alone reads."""
 
 
 class ModelSection(Section):

@@ -26,6 +26,7 @@ PRINTED: Mapping[str, Any] = {
     "model.landmarks.loading": "immediate",
     "model.landmarks.drag": 0.0,
     "model.landmarks.tip": "point",
+    "model.forces.law": "viscous",
     "model.forces.ramp": 0.0,
 }
 """The laws under which fields are linear in the parameters."""

@@ -91,12 +91,13 @@ def drawn(base: Scenario, index: int, seed: int, frames: int, variation: Variati
         centre = rng.uniform((0.1 * width, 0.1 * height), (0.9 * width, 0.9 * height))
         level = -100.0 if rng.random() < 0.3 else float(rng.uniform(-12.0, 9.0))
         regions.append({"level": level, "ellipse": {"centre": centre.tolist(), "half_axes": half.tolist()}})
+    limit = "friction" if base.model.forces.law == "viscous" else "friction_limit"
     values: dict[str, Any] = {
         "title": f"sample {index}, seed {seed}",
         "image.file": PHANTOM,
         "tissue.young": base.tissue.young * factor(v.young),
         "model.forces.tip": base.model.forces.tip * factor(v.tip_force),
-        "model.forces.friction": base.model.forces.friction * factor(v.friction),
+        f"model.forces.{limit}": getattr(base.model.forces, limit) * factor(v.friction),
         "probe.frequency": base.probe.frequency * factor(v.frequency),
         "probe.snr": float(rng.uniform(*v.snr)),
         "probe.attenuation": float(rng.uniform(*v.attenuation)),
