@@ -244,8 +244,6 @@ class SlipTissue {
       next_ = 1;
     }
     pending_ = false, wanted_index = -1;
-    const Outcome missing = answered(work_);
-    if (missing != done) return wait(missing, entry, tip, pose.dt);
     const Vec<2> along = tip - entry;
     const double depth = norm(along);
     if (depth < NO_LENGTH) {  // it has no direction and touches nothing
@@ -473,6 +471,8 @@ class SlipTissue {
         s.count = 1, s.push = s.cut = 0;
       }
     }
+    const Outcome missing = answered(s);  // only now: a track that has just been left for another needs none
+    if (missing != done) return missing;
     while (s.count < 2 || (static_cast<double>(s.count - 1) * law.spacing < s.cut + RUN_AHEAD * travel &&
                            stations_[s.count - 1].share > 0 && s.count < MOST_STATIONS)) {
       const int64_t j = s.count;

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from echospline.errors import InputError
 from echospline.mechanics.finite_elements import (
     Integration,
     Method,
@@ -47,6 +48,8 @@ class FEMResponse:
         solver: Method = "cholmod",
         integration: Integration | None = None,
     ) -> None:
+        if clamps.sliding:
+            raise InputError("finite elements do not know sliding edges yet; clamp the edge or leave it free")
         self._grid = grid
         young, poisson = tissue.in_cells(grid)
         if integration is None:

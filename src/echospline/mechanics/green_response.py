@@ -21,6 +21,8 @@ class GreenResponse:
             raise InputError(
                 "Green's function is that of homogeneous tissue; for tissue with regions use finite elements (fem)"
             )
+        if clamps.sliding:
+            raise InputError("Green's function does not know sliding edges yet; clamp the edge or leave it free")
         self._grid = grid
         self.green = GreensFunction(
             clamps.anchors(spacing), tissue.young, tissue.poisson, tissue.thickness, tissue.plane, radius,
