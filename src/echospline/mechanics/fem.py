@@ -12,14 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from echospline.mechanics.fem_response import FEMResponse
 from echospline.mechanics.finite_elements import (
     Integration,
     Method,
-    factor,
     interpolate,
     line_loads,
     point_loads,
-    stiffness,
 )
 from echospline.mechanics.forces import NeedleForces, check_step, travelled
 from echospline.mechanics.landmarks import Clamps
@@ -49,7 +48,7 @@ class FEMState:
 
 
 class FEMModel:
-    """Linear plane elasticity, clamped along edges, under a needle's forces; factored once, solved per step.
+    """Linear plane elasticity whose edges are clamped, slide or are free, under a needle's forces; factored once, solved per step.
 
     Parameters
     ----------
@@ -57,6 +56,8 @@ class FEMModel:
         Nodes of the mesh.
     clamped : iterable of {"top", "bottom", "left", "right"}
         Edges held fast: the same along which the spline has its anchors.
+    sliding : iterable of the same names
+        Edges along which the tissue slides without friction: they hold the displacement across themselves.
     tissue : Tissue
         Moduli per region, thickness, plane stress or strain.
     forces : NeedleForces
@@ -81,6 +82,7 @@ class FEMModel:
         tissue: Tissue | None = None,
         forces: NeedleForces | None = None,
         *,
+        sliding: Iterable[str] = (),
         clamped_points: ArrayLike | None = None,
         solver: Method = "cholmod",
         integration: Integration | None = None,
@@ -88,14 +90,10 @@ class FEMModel:
         self._grid = grid
         self.tissue = tissue or Tissue()
         self.forces = forces or NeedleForces()
-        self.clamped = Clamps.of(grid, clamped, clamped_points).nodes
-        young, poisson = self.tissue.in_cells(grid)
-        if integration is None:
-            integration = "selective" if self.tissue.plane == "strain" else "full"
-        self.stiffness = stiffness(
-            grid, young, poisson, self.tissue.thickness, self.tissue.plane, integration
-        )
-        self.factored = factor(self.stiffness, self.clamped, solver)
+        clamps = Clamps.of(grid, clamped, clamped_points, sliding)
+        self.clamped = clamps.nodes
+        self.response = FEMResponse(grid, clamps, self.tissue, solver=solver, integration=integration)
+        self.stiffness, self.factored = self.response.stiffness, self.response.factored
 
     @property
     def grid(self) -> RegularGrid:
@@ -135,6 +133,12 @@ class FEMModel:
             If a point lies outside the mesh: there is no tissue.
         """
         return interpolate(self.grid, state.displacement, points)
+
+    def loads(self, state: FEMState) -> Floats:
+        """Nodal loads (n, 2) in N that act on the tissue in a state."""
+        return (
+            state.friction if state.pose is None else state.friction + self.tip_loads(state.pose, state.tip)
+        )
 
     def friction_loads(self, pose: NeedlePose) -> Floats:
         """Nodal loads (n, 2) in N of steady friction at this pose and speed."""
