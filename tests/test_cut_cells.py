@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from cut_cell_reference import QuadraticPlane, needle
 
+from cut_cell_reference import QuadraticPlane, needle
 from echospline.mechanics import Clamps
 from echospline.mechanics.cut_cells import elements_of, isotropic, laminate, normals
 from echospline.mechanics.fem_response import FEMResponse

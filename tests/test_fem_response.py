@@ -4,8 +4,8 @@ from itertools import product
 
 import numpy as np
 import pytest
-from cut_cell_reference import QuadraticPlane, needle
 
+from cut_cell_reference import QuadraticPlane, needle
 from echospline.errors import InputError
 from echospline.mechanics import Clamps, FEMModel, NeedleForces
 from echospline.mechanics.fem_response import FEMResponse

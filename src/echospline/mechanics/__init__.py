@@ -8,6 +8,7 @@ from echospline.mechanics.kernels import Elastic, Kernel, ThinPlate
 from echospline.mechanics.landmark_stiffness import landmark_stiffness
 from echospline.mechanics.landmarks import Clamps
 from echospline.mechanics.native import describe_core
+from echospline.mechanics.neo_hookean_model import NeoHookeanModel
 from echospline.mechanics.parameters import TPSParameters
 from echospline.mechanics.protocol import TissueModel
 from echospline.mechanics.tps import Solver, TPSModel
@@ -20,6 +21,7 @@ __all__ = [
     "GreenModel",
     "Kernel",
     "NeedleForces",
+    "NeoHookeanModel",
     "Solver",
     "TPSModel",
     "TPSParameters",

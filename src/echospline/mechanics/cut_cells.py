@@ -53,7 +53,7 @@ def elements_of(tissue: Tissue, grid: RegularGrid) -> Elements:
         return Elements(young, poisson, np.empty(0, dtype=np.intp), np.empty((0, 3, 3)))
     E, nu = tissue.sampled(grid, np.arange(count), SEARCH)
     young, poisson = E[:, 0].copy(), nu[:, 0].copy()
-    cells = np.flatnonzero(((E != E[:, :1]) | (nu != nu[:, :1])).any(axis=1))
+    cells = np.flatnonzero(((E[:, :1] != E) | (nu != nu[:, :1])).any(axis=1))
     E, nu = tissue.sampled(grid, cells, SAMPLES)
     young[cells] = 1.0 / (1.0 / E).mean(axis=1)
     poisson[cells] = young[cells] * (nu / E).mean(axis=1)

@@ -409,7 +409,14 @@ def _cholmod(A: Any) -> Callable[[Floats], Floats]:
 
     def solve(rhs: Floats) -> Floats:
         x = kvxopt.matrix(np.asfortranarray(rhs))
-        cholmod.solve(numeric, x)
+        try:
+            cholmod.solve(numeric, x)
+        except (
+            ArithmeticError
+        ) as singular:  # a pivot of zero or less is reported here, not by the factorisation
+            raise SolverError(
+                "the stiffness matrix is not positive definite; check moduli and clamp"
+            ) from singular
         return np.array(x)
 
     return solve
