@@ -102,20 +102,13 @@ def laminate(young: Floats, poisson: Floats, normal: Floats, plane: Plane) -> Fl
     inverse = np.linalg.inv(nn)
     P = np.linalg.inv(inverse.mean(axis=1))
     Q = (inverse @ ns).mean(axis=1)
+    R = (ss - ns.swapaxes(-1, -2) @ inverse @ ns).mean(axis=1)
     L = np.zeros((len(young), 3, 3))
     L[:, [[0], [2]], common] = P
     L[:, common, 1] = L[:, 1, common] = (P @ Q)[..., 0]
-    L[:, 1, 1] = ((ss - ns.swapaxes(-1, -2) @ inverse @ ns).mean(axis=1) + Q.swapaxes(-1, -2) @ P @ Q)[
-        :, 0, 0
-    ]
-    c, s, zero = normal[:, 0], normal[:, 1], np.zeros(len(normal))
-    turn = np.stack(
-        [
-            np.stack([c * c, s * s, c * s], axis=-1),
-            np.stack([s * s, c * c, -c * s], axis=-1),
-            np.stack([-2 * c * s, 2 * c * s, c * c - s * s], axis=-1),
-        ],
-        axis=-2,
-    )
+    L[:, 1, 1] = (R + Q.swapaxes(-1, -2) @ P @ Q)[:, 0, 0]
+    c, s = normal[:, 0], normal[:, 1]
+    turn = np.array([[c * c, s * s, c * s], [s * s, c * c, -c * s], [-2 * c * s, 2 * c * s, c * c - s * s]])
+    turn = np.moveaxis(turn, -1, 0)  # strains (xx, yy, xy) to (nn, ss, ns)
     turned: Floats = turn.swapaxes(-1, -2) @ L @ turn
     return turned
