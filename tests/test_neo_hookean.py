@@ -9,6 +9,7 @@ from echospline.mechanics import Clamps, FEMModel, NeedleForces, NeoHookeanModel
 from echospline.mechanics.fem_response import FEMResponse
 from echospline.mechanics.finite_elements import line_loads, point_loads
 from echospline.mechanics.neo_hookean import NeoHookean, thickening
+from echospline.scenario import build_model, validated
 from echospline.scene import Circle, Insertion, Region, RegularGrid, Tissue
 
 GRID = RegularGrid((9, 7), (1.5, 2.0))  # 12 x 12 mm
@@ -180,3 +181,19 @@ def test_a_needle_in_stiff_tissue_moves_it_as_linear_elasticity_does_and_soft_ti
         np.testing.assert_allclose(large.displacement_at(b, grid.nodes[[77]]), v[[77]], atol=1e-14)
     assert shares[0] < 0.002
     assert 0.02 < shares[1] < 0.3
+
+
+def test_the_scenario_names_the_material_and_other_models_refuse_it():
+    grid = RegularGrid((9, 7), (5.0, 5.0))
+    scene = validated({"tissue": {"material": "neo-hookean", "young": 20.0}}, "test")
+    model = build_model(scene, grid, kind="fem")
+    assert isinstance(model, NeoHookeanModel)
+    assert model.material.tissue.young == 20.0
+    for kind in ("tps", "elastic", "green"):
+        with pytest.raises(InputError, match=rf"choose model fem, or material linear; got model {kind}"):
+            build_model(scene, grid, kind=kind)
+    assert isinstance(
+        build_model(scene.with_values({"tissue.material": "linear"}), grid, kind="fem"), FEMModel
+    )
+    with pytest.raises(InputError, match=r"tissue.material = 'rubber': should be 'linear' or 'neo-hookean'"):
+        validated({"tissue": {"material": "rubber"}}, "test")

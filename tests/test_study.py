@@ -80,6 +80,8 @@ def test_every_model_answers_or_refuses_every_scene(done):
     answered = {(row["scene"], row["model"]) for row in rows if row["refused"] is None}
     assert {(SCENES[0].name, m) for m in MODELS} <= answered
     assert (SCENES[2].name, "tps") in answered  # a soft lesion
+    mesh = [row["mae_percent_of_mean"] for row in rows if row["model"] == "fem" and row["refused"] is None]
+    assert 0 < max(mesh) < 12  # what the coarse mesh of this test costs
 
 
 def test_the_distance_of_linear_elasticity_grows_with_the_motion(done):

@@ -363,7 +363,7 @@ def _report(out: Path, result: Mapping[str, Any], extent: Extent, command: str) 
         ]),
         ("Lesions, layers and edges", [
             paragraph("The same needle, 10 kPa, where the paper did not look. Fitted as above, through the scenario that names the scene; Green's "
-                      "function has nothing fitted. An edge that is neither clamped nor sliding is free. The worst pose is the largest share of its own mean, of "
+                      "function and the finite elements have nothing fitted. The reference is finite elements on a mesh three times as fine. An edge that is neither clamped nor sliding is free. The worst pose is the largest share of its own mean, of "
                       "all deeper than 4 mm. A model that refuses a scene says why."),
             table(result["scenes"], _SCENES),
         ]),
