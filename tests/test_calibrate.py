@@ -64,7 +64,7 @@ def test_a_material_that_is_not_linear_is_refused(recorded, tmp_path):
         (recorded / "scenario.toml").read_text().replace('material = "linear"', 'material = "neo-hookean"')
     )
     (tmp_path / "scene.toml").write_text(scene)
-    with pytest.raises(InputError, match="set tissue.material = 'linear'"):
+    with pytest.raises(InputError, match=r"set tissue\.material = 'linear'"):
         calibrate(field=str(recorded), out=str(tmp_path), scenario=str(tmp_path / "scene.toml"))
 
 
