@@ -1,5 +1,6 @@
 """Finite elements that answer forces: every mix of clamped, sliding and free edges, against symmetry and quadratic elements."""
 
+import pickle
 from itertools import product
 
 import numpy as np
@@ -126,6 +127,15 @@ def test_load_cases_add_up_and_points_are_interpolated():
         response.answer(PLACES, FORCES[:1], PLACES)
     with pytest.raises(InputError, match="must lie in the mesh"):
         response.answer(PLACES, FORCES, [(50.0, 3.0)])
+
+
+def test_a_pickled_response_answers_alike():
+    response = made(MIXES[6], RegularGrid((13, 10), (40 / 12, 30 / 9)))
+    copy = pickle.loads(pickle.dumps(response))
+    for a, b in zip(
+        response.answer(PLACES, FORCES, PLACES), copy.answer(PLACES, FORCES, PLACES), strict=True
+    ):
+        np.testing.assert_array_equal(a, b)
 
 
 def test_the_response_is_said_in_one_sentence():

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
@@ -65,6 +68,11 @@ class FEMResponse:
             grid, made.young, made.poisson, tissue.thickness, tissue.plane, self.integration, made[2:]
         )
         self.factored = factor(self.stiffness, clamps.held, solver)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle what the response was made of; a copy factors anew."""
+        made = partial(FEMResponse, solver=self.factored.method, integration=self.integration)
+        return made, (self.grid, self.clamps, self.tissue)
 
     @property
     def grid(self) -> RegularGrid:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from echospline.mechanics.fem import FEMModel, FEMState
+from echospline.mechanics.fem import FEMModel
 from echospline.mechanics.finite_elements import Method, interpolate
 from echospline.mechanics.neo_hookean import Equilibrium, NeoHookean
 from echospline.scene import Floats, NeedlePose, RegularGrid
@@ -19,13 +20,13 @@ class NeoHookeanState:
 
     Attributes
     ----------
-    linear : FEMState
+    linear : state of a FEMModel
         Of the linear model, which the needle's forces come from.
     equilibrium : Equilibrium
         Those forces and the displacement that balances them.
     """
 
-    linear: FEMState
+    linear: Any
     equilibrium: Equilibrium
 
 
