@@ -96,6 +96,7 @@ OPTIONS = (
     Option("--ramp", "model.forces.ramp", "MM", None, "Model fem, green"),
     Option("--young", "tissue.young", "KPA", None, "Model fem, green"),
     Option("--poisson", "tissue.poisson", "NU", None, "Model fem, green"),
+    Option("--material", "tissue.material", "linear|neo-hookean", None, "Model fem"),
     Option("--thickness", "tissue.thickness", "MM", None, "Model fem, green"),
     Option("--fps", "output.fps", "N", None, "Output"),
     Option("--formats", "output.formats", "NAME,...", _words, "Output"),

@@ -21,7 +21,7 @@ def study(
         "out/study"
     ),
     quick: Annotated[
-        bool, typer.Option("--quick", help="about a minute: fewer depths, meshes and runs")
+        bool, typer.Option("--quick", help="one to three minutes: fewer depths, meshes and runs")
     ] = False,
     seed: Annotated[int, typer.Option("--seed", min=0, help="of the searches")] = 0,
     workers: Annotated[
@@ -36,7 +36,8 @@ def study(
     """Regenerate the paper's study: Fig. 2, 3a, 3b, tables (CSV, JSON) and one self-contained report.html.
 
     Every model is compared with finite elements under the same needle, in accuracy (fitted and held-out insertions, four
-    moduli in both readings) and in time per step (every method named). Cases that are in the folder already are not run again.
+    moduli in both readings) and in time per step (every method named). Lesions, layers and other edges follow, and where linear and plane
+    elasticity stop being good. Cases that are in the folder already are not run again.
     """
     if context.invoked_subcommand is not None:
         return

@@ -9,6 +9,7 @@ from echospline.mechanics.kernels import Elastic, Kernel, ThinPlate
 from echospline.mechanics.landmark_stiffness import landmark_stiffness
 from echospline.mechanics.landmarks import Clamps
 from echospline.mechanics.native import describe_core
+from echospline.mechanics.neo_hookean_model import NeoHookeanModel
 from echospline.mechanics.parameters import TPSParameters
 from echospline.mechanics.protocol import TissueModel
 from echospline.mechanics.tps import Solver, TPSModel
@@ -24,6 +25,7 @@ __all__ = [
     "Kernel",
     "NeedleForces",
     "NeedleLoad",
+    "NeoHookeanModel",
     "Solver",
     "TPSModel",
     "TPSParameters",

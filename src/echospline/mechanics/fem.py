@@ -62,7 +62,7 @@ State = FEMState | ForceState
 
 
 class FEMModel:
-    """Linear plane elasticity under a needle's forces; factored once.
+    """Linear plane elasticity whose edges are clamped, slide or are free, under a needle's forces; factored once.
 
     Parameters
     ----------
@@ -70,14 +70,14 @@ class FEMModel:
         Nodes of the mesh.
     clamped : iterable of {"top", "bottom", "left", "right"}
         Edges held fast: the same along which the spline has its anchors.
+    sliding : iterable of the same names
+        Edges along which the tissue slides without friction: they hold the displacement across themselves.
     tissue : Tissue
         Moduli per region, thickness, plane stress or strain.
     forces : NeedleForces or ViscousForces
         What the needle exerts: the law that sticks and slips, or the paper's.
     clamped_points : array_like, shape (k, 2), optional
         Further points held fast, mm: the mesh nodes nearest to them.
-    sliding : iterable of the same edges
-        Edges along which the tissue slides.
     solver : {"cholmod", "superlu"}
         See `finite_elements.factor`.
     integration : {"full", "selective"}, optional
@@ -96,8 +96,8 @@ class FEMModel:
         tissue: Tissue | None = None,
         forces: Forces | None = None,
         *,
-        clamped_points: ArrayLike | None = None,
         sliding: Iterable[str] = (),
+        clamped_points: ArrayLike | None = None,
         solver: Method = "cholmod",
         integration: Integration | None = None,
     ) -> None:
@@ -105,7 +105,7 @@ class FEMModel:
         clamps = Clamps.of(grid, clamped, clamped_points, sliding)
         self.clamped = clamps.nodes
         self.response = FEMResponse(grid, clamps, self.tissue, solver=solver, integration=integration)
-        self.factored = self.response.factored
+        self.stiffness, self.factored = self.response.stiffness, self.response.factored
         self.needle = (
             ForceModel(self.response, self.forces) if isinstance(self.forces, NeedleForces) else None
         )
@@ -171,6 +171,17 @@ class FEMModel:
         if state.pose is None:
             return NeedleLoad()
         return NeedleLoad(state.tip, float(np.sum(state.friction @ np.array(state.pose.axis))))
+
+    def loads(self, state: State) -> Floats:
+        """Nodal loads (n, 2) in N that act on the tissue in a state."""
+        if isinstance(state, FEMState):
+            return state.friction if state.pose is None else state.friction + self.tip_loads(state.pose, state.tip)
+        total = np.zeros((self.grid.size, 2))
+        for answered, force in zip(state.track, state.forces, strict=True):
+            station = answered.station
+            if len(station.points):
+                total += point_loads(self.grid, station.points, station.weights[:, None] * force)
+        return total
 
     def friction_loads(self, pose: NeedlePose) -> Floats:
         """Nodal loads (n, 2) in N of the viscous law's steady friction at this pose and speed."""

@@ -15,6 +15,7 @@ from echospline.mechanics import (
     GreenModel,
     Kernel,
     NeedleForces,
+    NeoHookeanModel,
     ThinPlate,
     TPSModel,
     TPSParameters,
@@ -52,11 +53,18 @@ def build_model(
     """
     kind = kind or scenario.model.kind
     tissue = scenario.make_tissue(folder or Path(), grid)
+    neo_hookean = scenario.tissue.material == "neo-hookean"
+    if neo_hookean and kind in MODELS and kind != "fem":
+        raise InputError(
+            f"tissue.material = 'neo-hookean' is large deformation, which finite elements alone compute: choose model fem, or "
+            f"material linear; got model {kind}"
+        )
     clamped, points = scenario.mesh.clamped, scenario.mesh.clamped_points
     if kind in ("fem", "green"):
         forces = _forces(scenario.model.forces)
         if kind == "fem":
-            return FEMModel(grid, clamped, tissue, forces, clamped_points=points)
+            linear = FEMModel(grid, clamped, tissue, forces, clamped_points=points)
+            return NeoHookeanModel(linear) if neo_hookean else linear
         radius = scenario.model.green.radius
         return GreenModel(grid, clamped, tissue, forces, clamped_points=points, radius=radius)
     parameters = TPSParameters(**scenario.model.landmarks.model_dump())

@@ -98,6 +98,9 @@ class TissueSection(Section):
     poisson: float = Field(0.45, ge=0, le=0.5, description="Poisson's ratio of the background")
     thickness: Millimetres = Field(40.0, gt=0, description="across the imaging plane, mm")
     plane: Literal["stress", "strain"] = Field("stress", description="plane stress (19) or plane strain")
+    material: Literal["linear", "neo-hookean"] = Field(
+        "linear", description="linear elasticity, or neo-hookean for large deformation (fem alone, offline)"
+    )
     region: list[RegionSection] = Field(
         default=[], description="layers, lesions; each on top of those before"
     )

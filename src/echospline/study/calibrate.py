@@ -148,7 +148,9 @@ def _observation(path: Path, needle: str | None, confidence: float) -> Observati
 
 def _forces(built: Any) -> FEMModel | GreenModel:
     if not isinstance(built, FEMModel | GreenModel):
-        raise InputError(f"{type(built).__name__} has no forces to identify")
+        raise InputError(
+            f"forces are identified where the field is linear in them; {type(built).__name__} is not: set tissue.material = 'linear'"
+        )
     return built
 
 
