@@ -112,8 +112,8 @@ def test_anchors_and_sources_are_those_of_the_plain_reading(dimension):
         chosen = replace(scene.parameters, contact_spacing=spacing, anchor_spacing=8.0 + case % 3)
         this = replace(scene, clamped=faces, points=points, parameters=chosen)
         oracle, session = this.oracle(), Session(this)
-        assert len(rows(oracle.anchors)) == len(oracle.anchors) == len(session.anchors())
-        assert rows(session.anchors()) == rows(oracle.anchors)
+        assert len(rows(oracle.anchors.places)) == len(oracle.anchors.places) == len(session.anchors())
+        assert rows(session.anchors()) == rows(oracle.anchors.places)
         assert session.sources().tolist() == oracle.lattice.tolist()
     single = replace(scene, clamped=("bottom",))
     if dimension == 2:
@@ -238,7 +238,7 @@ def test_every_side_of_a_box_can_be_clamped_alone_with_points():
         for pose in list(handling(8, scene.grid, DT))[:16]:
             state = oracle.advance(state, pose, DT)
             session.advance(pose, DT)
-        held = np.vstack([oracle.anchors, scene.grid.nodes[::101]])
+        held = np.vstack([oracle.anchors.places, scene.grid.nodes[::101]])
         np.testing.assert_allclose(
             session.displacement_at(held), oracle.displacement_at(state, held), rtol=0, atol=1e-7
         )

@@ -10,7 +10,7 @@ from echospline.mechanics.landmarks import Clamps
 from echospline.mechanics.native import describe_core
 from echospline.mechanics.parameters import TPSParameters
 from echospline.mechanics.protocol import TissueModel
-from echospline.mechanics.tps import Solver, TPSModel
+from echospline.mechanics.tps import Solver, TPSModel, anchors_for
 
 __all__ = [
     "AnchoredKernel",
@@ -25,6 +25,7 @@ __all__ = [
     "TPSParameters",
     "ThinPlate",
     "TissueModel",
+    "anchors_for",
     "describe_core",
     "landmark_stiffness",
 ]

@@ -100,7 +100,7 @@ class GreenModel:
         edges = tuple(clamped)
         self.station_spacing = station_spacing
         self.green = GreensFunction(
-            Clamps.of(grid, edges, clamped_points).anchors(anchor_spacing),
+            Clamps.of(grid, edges, clamped_points).anchors(anchor_spacing).places,
             self.tissue.young,
             self.tissue.poisson,
             self.tissue.thickness,
