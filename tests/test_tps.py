@@ -271,8 +271,8 @@ def test_parameters_out_of_range_are_refused(change, message):
 def test_a_scene_that_nothing_holds_is_refused():
     with pytest.raises(InputError, match="leaves it free to slide"):
         TPSModel(GRID, clamped=())
-    with pytest.raises(InputError, match="one line"):
-        TPSModel(GRID, clamped=("left",))
+    with pytest.raises(InputError, match="no edge holds the x direction, and 1 clamped point on one line"):
+        TPSModel(GRID, clamped=(), sliding=("top",), clamped_points=[(8.0, 12.0)])
     with pytest.raises(InputError, match="dt must be"):
         TPSModel(GRID).advance(TPSModel(GRID).rest(), NeedlePose((0, 0), (0, 0)), -1.0)
 

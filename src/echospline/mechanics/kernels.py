@@ -220,7 +220,9 @@ class Apart:
 
     def polynomial_gradient(self, points: Floats) -> Floats:
         """Return the derivatives of the affine motions, shape (D, D n, D (D + 1))."""
-        return np.stack([np.kron(np.eye(self.dimension), by) for by in self.plate.polynomial_gradient(points)])
+        return np.stack(
+            [np.kron(np.eye(self.dimension), by) for by in self.plate.polynomial_gradient(points)]
+        )
 
 
 @dataclass(frozen=True)

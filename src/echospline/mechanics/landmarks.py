@@ -238,9 +238,7 @@ class Clamps:
             held.append(np.broadcast_to(components, every[-1].shape))
         landmarks = np.vstack([*every, self.points])
         components = np.vstack([*held, np.ones(self.points.shape, dtype=bool)])
-        _, first, same = np.unique(
-            np.round(landmarks / 1e-6), axis=0, return_index=True, return_inverse=True
-        )
+        _, first, same = np.unique(np.round(landmarks / 1e-6), axis=0, return_index=True, return_inverse=True)
         together = np.zeros((len(first), len(low)), dtype=bool)
         np.logical_or.at(together, same.ravel(), components)
         order = np.argsort(first)

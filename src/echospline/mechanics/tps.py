@@ -47,7 +47,9 @@ def anchors_for(clamps: Clamps, kernel: Kernel, spacing: float) -> Anchors:
         If there are too many, or they leave a component free.
     """
     anchors = clamps.anchors(spacing, affine=not isinstance(kernel, Elastic))
-    condition(kernel, anchors.places, anchors.held)  # refuses anchors that hold nothing, before any step is made
+    condition(
+        kernel, anchors.places, anchors.held
+    )  # refuses anchors that hold nothing, before any step is made
     return anchors
 
 
