@@ -52,8 +52,8 @@ def test_one_step_equals_algorithm_1_by_another_library():
     near = (d <= 1.5) & (along <= pose.depth - 0.25 * 40 / 39) & ~clamped
     assert near.sum() > 20
     f = (0.05 + 0.3 / (1 + np.exp(d[near]))) * 5.0
-    landmarks = np.vstack([model.anchors, GRID.nodes[near], [pose.tip]])
-    moves = np.vstack([np.zeros_like(model.anchors), f[:, None] * a, [a]])
+    landmarks = np.vstack([model.anchors.places, GRID.nodes[near], [pose.tip]])
+    moves = np.vstack([np.zeros_like(model.anchors.places), f[:, None] * a, [a]])
     theirs = RBFInterpolator(landmarks, moves, kernel="thin_plate_spline")(GRID.nodes)
     np.testing.assert_allclose(ours, theirs, atol=1e-8)
 
@@ -69,7 +69,7 @@ def test_node_tip_moves_the_nearest_node_to_its_target():
 
 def test_anchors_hold():
     model = TPSModel(GRID)
-    u = model.displacement_at(drive(model, Insertion.straight((12, 0), 55, 20), 1 / 60), model.anchors)
+    u = model.displacement_at(drive(model, Insertion.straight((12, 0), 55, 20), 1 / 60), model.anchors.places)
     assert np.abs(u).max() < 1e-9
 
 
@@ -230,7 +230,7 @@ def test_odd_places_give_finite_fields(pose):
         u = model.displacement(state)
         assert np.isfinite(u).all()
         assert np.abs(u).max() < 20
-    assert np.abs(model.displacement_at(state, model.anchors)).max() < 1e-6
+    assert np.abs(model.displacement_at(state, model.anchors.places)).max() < 1e-6
 
 
 def test_the_push_fades_towards_a_clamped_edge():
@@ -271,8 +271,8 @@ def test_parameters_out_of_range_are_refused(change, message):
 def test_a_scene_that_nothing_holds_is_refused():
     with pytest.raises(InputError, match="leaves it free to slide"):
         TPSModel(GRID, clamped=())
-    with pytest.raises(InputError, match="one line"):
-        TPSModel(GRID, clamped=("left",))
+    with pytest.raises(InputError, match="no edge holds the x direction, and 1 clamped point on one line"):
+        TPSModel(GRID, clamped=(), sliding=("top",), clamped_points=[(8.0, 12.0)])
     with pytest.raises(InputError, match="dt must be"):
         TPSModel(GRID).advance(TPSModel(GRID).rest(), NeedlePose((0, 0), (0, 0)), -1.0)
 

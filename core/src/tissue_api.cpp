@@ -88,6 +88,13 @@ echospline_status check_choices(const echospline_scene_options& o, Message& m) {
   if (o.clamped & ~edges)
     return refuse(m, ECHOSPLINE_WRONG_VALUE, "clamped must be bits of ECHOSPLINE_LEFT ... in %d dimensions; got %u",
                   o.dimension, o.clamped);
+  if (o.sliding & ~edges)
+    return refuse(m, ECHOSPLINE_WRONG_VALUE, "sliding must be bits of ECHOSPLINE_LEFT ... in %d dimensions; got %u",
+                  o.dimension, o.sliding);
+  if (o.clamped & o.sliding)
+    return refuse(m, ECHOSPLINE_WRONG_VALUE,
+                  "an edge is clamped, sliding or free; got clamped %u and sliding %u, which share an edge", o.clamped,
+                  o.sliding);
   return ECHOSPLINE_OK;
 }
 
@@ -125,19 +132,21 @@ echospline_status check_clamped(const echospline_scene_options& o, Message& m) {
         return refuse(m, ECHOSPLINE_WRONG_VALUE, "every clamped point must lie inside the mesh; point %lld does not",
                       static_cast<long long>(i));
     }
-  double anchors = static_cast<double>(o.clamped_point_count);
+  const double per = o.kernel == ECHOSPLINE_ELASTIC ? o.dimension : 1;
+  double anchors = static_cast<double>(o.clamped_point_count) * per;
   for (int edge = 0; edge < 2 * o.dimension; ++edge) {
-    if (!(o.clamped >> edge & 1)) continue;
-    double on_edge = 1;
+    if (!((o.clamped | o.sliding) >> edge & 1)) continue;
+    double on_edge = o.clamped >> edge & 1 ? per : 1;
+    // where no other edge holds a component, a thin plate has a second row
+    if (o.kernel == ECHOSPLINE_THIN_PLATE && !(o.clamped & ~(1u << edge))) on_edge *= 2;
     for (int d = 0; d < o.dimension; ++d)
       if (d != edge / 2) on_edge *= std::ceil((o.shape[d] - 1) * o.spacing[d] / o.anchor_spacing) + 1;
     anchors += on_edge;
   }
-  const double per = o.kernel == ECHOSPLINE_ELASTIC ? o.dimension : 1;
-  if (anchors * per > static_cast<double>(MOST_ANCHORS))
+  if (anchors > static_cast<double>(MOST_ANCHORS))
     return refuse(m, ECHOSPLINE_WRONG_SIZE,
-                  "what is clamped may have %lld anchors (elastic: components); got %.0f: raise anchor_spacing",
-                  static_cast<long long>(MOST_ANCHORS), anchors * per);
+                  "what is held may have %lld anchors (elastic: components); got %.0f: raise anchor_spacing",
+                  static_cast<long long>(MOST_ANCHORS), anchors);
   if (o.contact_room < 0 || o.contact_room > 1 << 20)
     return refuse(m, ECHOSPLINE_WRONG_SIZE, "contact_room must be 0 to %d; got %lld", 1 << 20,
                   static_cast<long long>(o.contact_room));

@@ -134,6 +134,7 @@ class Session {
     o.loading = choices_.whole(0, 1);
     o.plane = choices_.whole(0, 1);
     if (choices_.below(4) == 0) o.clamped = choices_.byte();
+    if (choices_.below(4) == 0) o.sliding = choices_.byte() & (choices_.below(4) ? ~o.clamped : ~0u);
     o.level = choices_.below(4) == 0 ? choices_.whole(0, 5) : ECHOSPLINE_LEVEL_BEST;
     const int32_t most = o.dimension == 3 ? 6 : 17;
     for (int k = 0; k < 3; ++k) {

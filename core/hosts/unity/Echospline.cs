@@ -107,6 +107,8 @@ namespace Echospline
         public IntPtr Stiffness;
         public long StiffnessCount;
         public long ContactRoom;
+        public Edge Sliding;
+        public uint Reserved;
 
         /// <summary>The core's own defaults; shape and spacing have to be set.</summary>
         public static SceneOptions Defaults()

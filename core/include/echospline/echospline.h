@@ -3,7 +3,7 @@
  *
  * Scenes are read-only and shared by threads; one tissue, and one picture, belongs to one thread at a time.
  *
- * - A *scene* is what is given: mesh, clamped edges, parameters. It is factored once and never changes.
+ * - A *scene* is what is given: mesh, clamped and sliding edges, parameters. It is factored once and never changes.
  * - A *tissue* is one needle's session in a scene: the present state and the workspace that makes a step fast.
  *   States are values: `echospline_state_save` and `echospline_state_load` carry them as versioned bytes.
  * - A *picture* is a reference image, its deformation and the needle's echo.
@@ -48,7 +48,7 @@ enum {
   ECHOSPLINE_WRONG_SIZE = 2,    /* a struct_size, count or shape that does not fit */
   ECHOSPLINE_WRONG_VALUE = 3,   /* a number out of its range or not finite, an unknown choice */
   ECHOSPLINE_OUT_OF_MEMORY = 4, /* nothing has changed */
-  ECHOSPLINE_NOT_HELD = 5,      /* what is clamped does not determine the field */
+  ECHOSPLINE_NOT_HELD = 5,      /* what is held does not determine the field */
   ECHOSPLINE_NOT_SOLVED = 6,    /* landmarks cannot be told apart; the state has not changed */
   ECHOSPLINE_WRONG_STATE = 7,   /* bytes of another version or scene, or damaged */
   ECHOSPLINE_FAILED_HANDLE = 8, /* the handle's create had failed: it only carries a message */
@@ -86,7 +86,7 @@ enum { ECHOSPLINE_SINGLE = 0, ECHOSPLINE_DOUBLE = 1 };             /* precision 
 enum { ECHOSPLINE_TIP_POINT = 0, ECHOSPLINE_TIP_NODE = 1 };        /* landmark of the tip */
 enum { ECHOSPLINE_FOLLOW = 0, ECHOSPLINE_IMMEDIATE = 1 };          /* loading */
 enum { ECHOSPLINE_PLANE_STRESS = 0, ECHOSPLINE_PLANE_STRAIN = 1 }; /* elastic kernel in the plane */
-enum {                                                             /* clamped edges (2-D) or faces (3-D), bits */
+enum {                                                             /* edges (2-D) or faces (3-D), bits */
        ECHOSPLINE_LEFT = 1,                                        /* least x */
        ECHOSPLINE_RIGHT = 2,
        ECHOSPLINE_TOP = 4, /* least y: at the probe */
@@ -103,7 +103,7 @@ typedef struct echospline_scene_options {
   int32_t tip;
   int32_t loading;
   int32_t plane;
-  uint32_t clamped; /* bits of ECHOSPLINE_LEFT ... */
+  uint32_t clamped; /* edges that do not move: bits of ECHOSPLINE_LEFT ... */
   int32_t level;
   int32_t shape[3];             /* nodes along x, y, z, 2 or more each */
   double spacing[3];            /* mm */
@@ -115,7 +115,7 @@ typedef struct echospline_scene_options {
   double length;                /* length in the exponential of equation (15), mm */
   double drag;                  /* share of the shaft's sideways motion that contacts follow, 0 to 1 */
   double contact_spacing;       /* distance between nodes that may become contacts, mm; 0: every node */
-  double anchor_spacing;        /* greatest distance between anchors along clamped edges, mm */
+  double anchor_spacing;        /* greatest distance between anchors along held edges, mm */
   double poisson;               /* elastic kernel: Poisson's ratio */
   double radius;                /* elastic kernel: regularisation length, mm */
   const double* clamped_points; /* (clamped_point_count, dimension) mm, or NULL */
@@ -123,6 +123,8 @@ typedef struct echospline_scene_options {
   const double* stiffness; /* per mesh node, how firmly a landmark there holds its displacement; NULL: infinitely */
   int64_t stiffness_count; /* number of mesh nodes, or 0 */
   int64_t contact_room;    /* contacts for which memory is reserved; 0 chooses. More are possible and allocate once. */
+  uint32_t sliding; /* edges that move along themselves alone, without friction: bits as `clamped`. Others are free. */
+  uint32_t reserved;
 } echospline_scene_options;
 
 typedef struct echospline_scene echospline_scene;

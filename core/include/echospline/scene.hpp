@@ -1,4 +1,4 @@
-// A scene: mesh, clamped edges, parameters, and what can be computed of them once. Never changes after `build`; threads share it.
+// A scene: mesh, what is held, parameters, and what can be computed of them once. Never changes after `build`; threads share it.
 #pragma once
 #include "anchored_kernel.hpp"
 #include "grid.hpp"
@@ -52,9 +52,10 @@ struct Scene {
   /// Compute what grid, clamps, interaction and stiffness imply.
   template <class KernelFor>
   Outcome build(double contact_spacing, double anchor_spacing, KernelFor kernel_for, FieldFor field_for) {
-    Array<Vec<D>> anchors;
-    if (!anchors.reserve(clamps.anchors(grid, anchor_spacing, nullptr))) return no_memory;
-    const int64_t count = clamps.anchors(grid, anchor_spacing, anchors.data());
+    Array<Anchor<D>> anchors;
+    const bool affine = kernel_for(1.0).affine;
+    if (!anchors.reserve(clamps.anchors(grid, anchor_spacing, affine, nullptr))) return no_memory;
+    const int64_t count = clamps.anchors(grid, anchor_spacing, affine, anchors.data());
     switch (anchored.build(anchors.data(), count, kernel_for)) {
       case AnchoredKernel<D>::no_memory: return no_memory;
       case AnchoredKernel<D>::not_held: return not_held;

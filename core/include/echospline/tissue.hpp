@@ -392,7 +392,7 @@ class Tissue {
   void move_tip(const Needle<D>& n, double left_over, Step& step) {
     const Interaction& p = scene.interaction;
     const TipLandmark<D>& before = state.tip;
-    const double clearance = scene.clamps.clearance(scene.grid, n.tip);
+    const double clearance = scene.clamps.clearance(scene.grid, n.tip, n.axis);
     Vec<D> place = n.tip;
     bool can_move = true;
     if (p.on_node) {

@@ -174,6 +174,8 @@ class SceneOptions(ctypes.Structure):
         ("stiffness", c_void_p),
         ("stiffness_count", c_int64),
         ("contact_room", c_int64),
+        ("sliding", c_uint32),
+        ("reserved", c_uint32),
     ]
 
 

@@ -12,7 +12,7 @@ from echospline.mechanics.native import describe_core
 from echospline.mechanics.neo_hookean_model import NeoHookeanModel
 from echospline.mechanics.parameters import TPSParameters
 from echospline.mechanics.protocol import TissueModel
-from echospline.mechanics.tps import Solver, TPSModel
+from echospline.mechanics.tps import Solver, TPSModel, anchors_for
 
 __all__ = [
     "AnchoredKernel",
@@ -32,6 +32,7 @@ __all__ = [
     "ThinPlate",
     "TissueModel",
     "ViscousForces",
+    "anchors_for",
     "describe_core",
     "landmark_stiffness",
 ]

@@ -175,7 +175,11 @@ class FEMModel:
     def loads(self, state: State) -> Floats:
         """Nodal loads (n, 2) in N that act on the tissue in a state."""
         if isinstance(state, FEMState):
-            return state.friction if state.pose is None else state.friction + self.tip_loads(state.pose, state.tip)
+            return (
+                state.friction
+                if state.pose is None
+                else state.friction + self.tip_loads(state.pose, state.tip)
+            )
         total = np.zeros((self.grid.size, 2))
         for answered, force in zip(state.track, state.forces, strict=True):
             station = answered.station

@@ -98,7 +98,7 @@ class NativeStep:
     grid : RegularGrid
         The mesh.
     clamps : Clamps
-        The clamped edges and points.
+        The clamped and sliding edges, and clamped points.
     parameters : TPSParameters
         Of the interaction.
     kernel : Kernel
@@ -289,6 +289,7 @@ def _options(
     o.tip = core.Tip.TIP_NODE if p.tip == "node" else core.Tip.TIP_POINT
     o.loading = core.Loading.IMMEDIATE if p.loading == "immediate" else core.Loading.FOLLOW
     o.clamped = int(sum(core.Edge[edge.upper()] for edge in set(clamps.edges)))
+    o.sliding = int(sum(core.Edge[edge.upper()] for edge in set(clamps.sliding)))
     for d in (0, 1):
         o.shape[d], o.spacing[d], o.origin[d] = grid.shape[d], grid.spacing[d], grid.origin[d]
     o.sigma, o.delta, o.alpha1, o.alpha2, o.alpha3 = p.sigma, p.delta, p.alpha1, p.alpha2, p.alpha3

@@ -21,7 +21,7 @@ from echospline.mechanics.interaction import (
     tip_push,
 )
 from echospline.mechanics.kernels import Kernel
-from echospline.mechanics.landmarks import Clamps, Mesh
+from echospline.mechanics.landmarks import Anchors, Clamps, Mesh
 from echospline.mechanics.parameters import TPSParameters
 from echospline.mechanics.spline import Spline, factor
 from echospline.scene import ZERO_LENGTH, Floats
@@ -102,9 +102,9 @@ class Reference:
     kernel : Kernel
         `ThinPlate` (the paper) or `Elastic`, of the mesh's dimension.
     clamps : Clamps
-        The clamped edges (faces) and points.
-    anchors : ndarray, shape (a, D)
-        Landmarks along them that stay, mm.
+        The clamped and sliding edges (faces), and clamped points.
+    anchors : Anchors
+        Landmarks along them that stay.
     lattice : ndarray of int, shape (K,)
         Mesh nodes that may become contacts.
     gap : float
@@ -119,7 +119,7 @@ class Reference:
         parameters: TPSParameters,
         kernel: Kernel,
         clamps: Clamps,
-        anchors: Floats,
+        anchors: Anchors,
         lattice: Nodes,
         gap: float,
         stiffness: Floats | None,
@@ -263,14 +263,14 @@ class Reference:
     ) -> Tip | None:
         """Return the tip's landmark, equation (12); None where the tip pushes nothing."""
         p, axis, point = self.parameters, np.array(pose.axis), np.asarray(pose.tip)
-        clearance = self.clamps.clearance(pose.tip)
+        clearance = self.clamps.clearance(pose.tip, axis)
         if clearance <= 0.0 or p.sigma == 0.0:
             return None
         push = tip_push(pose, p.sigma, clearance) * axis
         advancing = pose.speed >= 0 and pose.depth >= ZERO_LENGTH
         if p.tip == "node":
             node = self.grid.nearest(pose.tip)
-            if not advancing or node in self.clamps.nodes:
+            if not advancing or self.clamps.held[node].any():
                 return None
             place = self.grid.nodes[node]
             return Tip(place, point + push - place)
@@ -324,16 +324,18 @@ class Reference:
         """Spline through anchors, contacts and tip; None where there is nothing but anchors."""
         if tip is None and len(contacts) == 0:
             return None
-        landmarks = [self.anchors, self.grid.nodes[contacts]]
-        moves = [np.zeros_like(self.anchors), q]
+        anchors = self.anchors.places
+        landmarks = [anchors, self.grid.nodes[contacts]]
+        moves = [np.zeros_like(anchors), q]
         if tip is not None:
             apart = _lengths(landmarks[1] - tip.point) > 1e-6  # a tip on a node speaks for it
             contacts = contacts[apart]
-            landmarks = [self.anchors, landmarks[1][apart], tip.point[None]]
+            landmarks = [anchors, landmarks[1][apart], tip.point[None]]
             moves = [moves[0], q[apart], tip.q[None]]
-        return factor(self.kernel, np.vstack(landmarks), self._stiffness(contacts, tip)).solve(
-            np.vstack(moves)
-        )
+        every = np.vstack(landmarks)
+        held = np.ones(every.shape, dtype=bool)
+        held[: len(anchors)] = self.anchors.held
+        return factor(self.kernel, every, self._stiffness(contacts, tip), held).solve(np.vstack(moves))
 
     def _stiffness(self, contacts: Nodes, tip: Tip | None) -> Floats | None:
         """Return the stiffness of anchors (infinite), contacts and tip."""

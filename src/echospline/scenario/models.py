@@ -20,6 +20,7 @@ from echospline.mechanics import (
     TPSModel,
     TPSParameters,
     ViscousForces,
+    anchors_for,
     landmark_stiffness,
 )
 from echospline.mechanics.protocol import TissueModel
@@ -74,7 +75,7 @@ def build_model(
         nu = tissue.poisson if section.poisson is None else section.poisson
         kernel = Elastic(nu, section.radius, tissue.plane)
     if kind in ("tps", "elastic"):
-        anchors = Clamps.of(grid, clamped, points).anchors(parameters.anchor_spacing)
+        anchors = anchors_for(Clamps.of(grid, clamped, points), kernel, parameters.anchor_spacing)
         stiffness = None if tissue.homogeneous else landmark_stiffness(tissue, grid, kernel, anchors)
         return TPSModel(grid, clamped, parameters, kernel, clamped_points=points, stiffness=stiffness)
     raise InputError(f"a model is one of {', '.join(MODELS)}; got {kind!r}")

@@ -234,7 +234,7 @@ def oracle(grid: RegularGrid, seen: Observation, kernel: Kernel) -> Floats:
 
     No law of interaction can do better with these landmarks: the remaining error is the kernel's own.
     """
-    anchors = TPSModel(grid, CLAMPED, PRINTED, kernel).anchors
+    anchors = TPSModel(grid, CLAMPED, PRINTED, kernel).anchors.places
     inside = np.setdiff1d(np.arange(grid.size), grid.boundary(CLAMPED))
     fields = []
     for pose, u in zip(seen.poses, seen.displacement, strict=True):

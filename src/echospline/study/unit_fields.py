@@ -172,7 +172,9 @@ class SplineFields:
         self.linear: dict[str, float] = {"alpha1": -np.inf, "alpha2": -np.inf, "sigma": 1e-3}
         self.search = {"length": length} | ({"alpha3": alpha3} if observation.rests else {})
         self.levels = {"delta": tuple(delta)}
-        self._scene = AnchoredKernel.factor(model.kernel, model.anchors, observation.points)
+        self._scene = AnchoredKernel.factor(
+            model.kernel, model.anchors.places, observation.points, held=model.anchors.held
+        )
         nodes = model.grid.nodes[model.lattice]
         reach = [
             pose.closest(nodes)[1] <= max(delta) for pose in observation.poses if pose.depth >= ZERO_LENGTH
@@ -204,7 +206,7 @@ class SplineFields:
         along[:m, 1] = friction(frame.distance, speed, 0.0, 1.0, values["length"])
         if frame.tip is not None:
             sigma = values.get("sigma", 1.0)
-            along[m, 2] = tip_push(frame.pose, sigma, self.model.clamps.clearance(frame.pose.tip)) / sigma
+            along[m, 2] = tip_push(frame.pose, sigma, self._clearance(frame.pose)) / sigma
         axis = np.array(frame.pose.axis)
         if c == 2:
             along = np.repeat(along, 2, axis=0) * np.tile(axis, len(along))[:, None]
@@ -216,9 +218,13 @@ class SplineFields:
             return np.asarray(field[:, None, :] * axis[:, None])
         return np.asarray(field.reshape(2, -1, 3).transpose(1, 0, 2))
 
+    def _clearance(self, pose: NeedlePose) -> float:
+        """Distance over which the tip can push, mm."""
+        return self.model.clamps.clearance(pose.tip, pose.axis)
+
     def _tip(self, pose: NeedlePose, candidates: Floats) -> _Tip | None:
         """Return the tip's responses; None where it pushes nothing."""
-        if pose.speed < 0 or pose.depth < ZERO_LENGTH or self.model.clamps.clearance(pose.tip) <= 0:
+        if pose.speed < 0 or pose.depth < ZERO_LENGTH or self._clearance(pose) <= 0:
             return None
         place = np.array([pose.tip])
         x = self._scene.conditioned(place)
