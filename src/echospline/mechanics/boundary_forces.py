@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import qr, solve_triangular
 
 from echospline.errors import InputError
 from echospline.mechanics.half_plane import HalfPlane
@@ -33,8 +34,9 @@ OUTSIDE = 2.0
 """Distance of the forces from their edge, in their spacings. Nearer, the field between them ripples; farther, the system is ill
 conditioned."""
 
-ROWS = 2
-"""Conditions per force. One for one lets the field between the conditions go astray by up to 40 %."""
+ROWS = 2.5
+"""Conditions per force. One for one lets the field between the conditions go astray by up to 40 %; with two, they all stand where
+the ripple of a row of forces crosses zero."""
 
 INTERFACE = 1.0 / 30.0
 """Spacing of forces along an interface, in the shorter side of the tissue (1 mm for 30)."""
@@ -51,8 +53,11 @@ WEIGHT = 0.2
 PIN = 10.0
 """Weight of the displacement of a clamped point, of which there are few, beside that of a condition on an edge."""
 
-RANK = 1e-11
-"""Singular values below this share of the largest are rounding errors."""
+NEAREST = 0.75
+"""Least distance of a force from an edge or interface, in the spacing of the forces outside the edges."""
+
+RANK = 1e-9
+"""Pivots below this share of the largest are left out: their strengths would be huge and cancel each other."""
 
 SMOOTH = 1e-7
 """Accuracy to which the field of forces outside the edges is interpolated from a Chebyshev lattice on fine meshes."""
@@ -109,6 +114,16 @@ class Piece:
     bodies: tuple[int, ...]
     kind: Kind = "free"
     axis: int = 0
+
+    @property
+    def moves(self) -> bool:
+        """Whether a condition speaks of displacement."""
+        return len(self.bodies) == 2 or self.kind != "free"
+
+    @property
+    def pulls(self) -> bool:
+        """Whether a condition speaks of traction."""
+        return len(self.bodies) == 2 or self.kind != "clamped"
 
 
 @dataclass(frozen=True)
@@ -228,6 +243,24 @@ class BoundaryForces:
         at = self._base(p, s, F) + self._columns(p) @ c
         return mesh.reshape(len(nodes), 2, -1), at.reshape(len(p), 2, -1)
 
+    @property
+    def nearest(self) -> float:
+        """Distance of a force from an edge or an interface below which the conditions there cannot follow it, mm."""
+        return NEAREST * self.spacing
+
+    def clearance(self, places: Floats) -> Floats:
+        """Distance of places (m, 2) from the edges that forces outside represent and from the interfaces, mm, shape (m,).
+
+        A free or a sliding top is exact, and no edge here.
+        """
+        x0, x1, y0, y1 = self.grid.extent
+        x, y = places.T
+        gaps = [x - x0, x1 - x, y1 - y, self.partition.distance(places)]
+        if self.clamps.kind("top") == "clamped":
+            gaps.append(y - y0)
+        nearest: Floats = np.min(gaps, axis=0)
+        return nearest
+
     def describe(self) -> str:
         """Return in one sentence how the tissue is solved, and its residual."""
         parts = len(self.bodies)
@@ -245,11 +278,13 @@ class BoundaryForces:
     # -- set-up ----------------------------------------------------------------------------------------------------
 
     def _decomposed(self) -> tuple[Floats, Floats]:
-        """Pseudo-inverse of the conditions as two factors."""
-        M = self._conditions(check=False)
-        U, singular, V = np.linalg.svd(M, full_matrices=False)
-        kept = singular > RANK * singular[0]
-        return V[kept].T / singular[kept], np.ascontiguousarray(U[:, kept].T)
+        """Least squares of the conditions as two factors: by QR with pivoting, two to three times as fast as singular values."""
+        Q, R, order = qr(self._conditions(check=False), mode="economic", pivoting=True, check_finite=False)
+        size = np.abs(np.diag(R))
+        rank = int((size > RANK * size[0]).sum())
+        right = np.zeros((R.shape[1], rank))
+        right[order[:rank]] = solve_triangular(R[:rank, :rank], np.eye(rank), check_finite=False)
+        return right, np.ascontiguousarray(Q[:, :rank].T)
 
     def _conditions(self, check: bool) -> Floats:
         """What unit strengths do to the conditions, shape (rows, unknowns)."""
@@ -258,8 +293,8 @@ class BoundaryForces:
             rows = []
             for q in piece.bodies:
                 points, normals = _where(piece, check)
-                u = self._own(q, points)
-                t = self._weight * self._own_traction(q, points, normals)
+                u = self._own(q, points) if piece.moves else None
+                t = self._weight * self._own_traction(q, points, normals) if piece.pulls else None
                 rows.append(self._placed(q, _combine(piece, u, t)))
             blocks.append(rows[0] if len(rows) == 1 else rows[0] - rows[1])
         M = np.vstack(blocks)
@@ -277,8 +312,12 @@ class BoundaryForces:
             rows = []
             for q in piece.bodies:
                 base = self.bodies[q].base
-                u = base.displacement(points, places, self.radius)
-                t = self._weight * base.traction(points, normals, places, self.radius)
+                u = base.displacement(points, places, self.radius) if piece.moves else None
+                t = (
+                    self._weight * base.traction(points, normals, places, self.radius)
+                    if piece.pulls
+                    else None
+                )
                 rows.append(_combine(piece, u, t))
             blocks.append(rows[0] if len(rows) == 1 else rows[0] - rows[1])
         return np.vstack(blocks)
@@ -359,6 +398,7 @@ class BoundaryForces:
         x0, x1, y0, y1 = self.grid.extent
         u, v = (np.arange(4) + 0.5) / 4, (np.arange(3) + 0.5) / 3
         places = np.stack([a.ravel() for a in np.meshgrid(x0 + u * (x1 - x0), y0 + v * (y1 - y0))], axis=1)
+        places = places[self.clearance(places) >= self.nearest]
         F = np.eye(2 * len(places))
         c = self._strengths(places, F)
         M = self._conditions(check=True)[: -2 * len(self.clamps.points) or None]
@@ -526,8 +566,8 @@ def lay_out(
         band = int(np.searchsorted(depths, circle.centre[1], side="right")) - 1
         sources[band].append(_ring(circle, circle.radius - min(INNER * step, 0.7 * circle.radius), count)[0])
         sources.append([_ring(circle, circle.radius + OUTER * step, count)[0]])
-        points, out = _ring(circle, circle.radius, ROWS * count)
-        between, out_between = _ring(circle, circle.radius, ROWS * count, 0.0)
+        points, out = _ring(circle, circle.radius, round(ROWS * count))
+        between, out_between = _ring(circle, circle.radius, round(ROWS * count), 0.0)
         pieces.append(Piece(points, -out, between, -out_between, (band, bands + i)))
     bodies = []
     for q, (young, poisson) in enumerate(moduli):
@@ -541,16 +581,15 @@ def _where(piece: Piece, check: bool) -> tuple[Floats, Floats]:
     return (piece.between, piece.normals_between) if check else (piece.points, piece.normals)
 
 
-def _combine(piece: Piece, u: Floats, t: Floats) -> Floats:
+def _combine(piece: Piece, u: Floats | None, t: Floats | None) -> Floats:
     """Rows of a piece from displacement and weighted traction."""
+    if t is None or u is None:
+        return np.vstack([rows for rows in (u, t) if rows is not None])
     if len(piece.bodies) == 2:
         return np.vstack([u, t])
-    if piece.kind == "clamped":
-        return u
-    if piece.kind == "sliding":
-        t = t.copy()
-        t[piece.axis :: 2] = u[piece.axis :: 2]
-    return t
+    mixed = t.copy()
+    mixed[piece.axis :: 2] = u[piece.axis :: 2]
+    return mixed
 
 
 def _summed(base: HalfPlane, points: Floats, places: Floats, forces: Floats, radius: float) -> Floats:
