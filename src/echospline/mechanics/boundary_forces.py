@@ -23,12 +23,13 @@ from echospline.scene import EDGES, Circle, Floats, Layer, RegularGrid, Tissue, 
 
 Kind = Literal["clamped", "sliding", "free"]
 
-ACROSS = 15
-"""Spacings of the forces outside the edges in the shorter side of the tissue (2 mm for 30). Fewer leave 0.2 to 0.4 % more error,
-more cost set-up time."""
+ACROSS, ACROSS_REGIONS = 20, 15
+"""Spacings of the forces outside the edges in the shorter side of the tissue (1.5 and 2 mm for 30): homogeneous, and with regions,
+whose interfaces cost set-up time. Fewer double the residual, more the set-up."""
 
-AROUND = 240
-"""Spacings in the whole outline at most: flat tissue gets a coarser spacing, and its residual shows whether that is enough."""
+AROUND = 16
+"""Spacings in the whole outline at most, in those of the shorter side: flat tissue gets a coarser spacing, and its residual shows
+whether that is enough."""
 
 OUTSIDE = 2.0
 """Distance of the forces from their edge, in their spacings. Nearer, the field between them ripples; farther, the system is ill
@@ -40,6 +41,12 @@ the ripple of a row of forces crosses zero."""
 
 INTERFACE = 1.0 / 30.0
 """Spacing of forces along an interface, in the shorter side of the tissue (1 mm for 30)."""
+
+THIN = 3
+"""Forces along each side of a band at least."""
+
+THINNEST = 2.0
+"""Least thickness of a band in the spacing along interfaces: conditions on its sides would be too few to balance it."""
 
 FEWEST, MOST = 24, 72
 """Forces along a round interface, on each side."""
@@ -61,6 +68,9 @@ RANK = 1e-9
 
 SMOOTH = 1e-7
 """Accuracy to which the field of forces outside the edges is interpolated from a Chebyshev lattice on fine meshes."""
+
+MANY = 600
+"""Unknowns of tissue with regions at most: more would take longer to set up than a live solve."""
 
 LARGEST = 2.5e8
 """Bytes of the matrix from forces along interfaces to mesh nodes at most."""
@@ -216,14 +226,15 @@ class BoundaryForces:
             raise InputError(f"tissue needs a mesh of 2 x 2 nodes or more; got {grid.shape}")
         self._grid, self.clamps, self.tissue, self.radius = grid, clamps, tissue, radius
         short = min(x1 - x0, y1 - y0)
-        self.spacing = max(short / ACROSS, 2.0 * (x1 - x0 + y1 - y0) / AROUND)
         self.partition, moduli = divide(tissue, grid)
-        if len(moduli) > 1:
-            refuse_large(grid, self.partition, self.spacing)
+        across = ACROSS if len(moduli) == 1 else ACROSS_REGIONS
+        self.spacing = max(short, 2.0 * (x1 - x0 + y1 - y0) / AROUND) / across
         self.bodies, self._pieces = lay_out(self, moduli, short * INTERFACE)
         rigid = {"free": 3, "sliding": 1, "clamped": 0, None: 3}
         self._counts = [2 * len(b.sources) + rigid[b.outside.top] for b in self.bodies]
-        self._weight = WEIGHT * short / self.bodies[0].base.stiffness
+        self._refuse_large()
+        # The softest band, for a traction missed there moves it most; a softer lesion must not outweigh everything else.
+        self._weight = WEIGHT * short / min(b.base.stiffness for b in self.bodies[: len(self.partition.depths) - 1])
         self._solution = self._decomposed()
         self._nodes = self._evaluation()
         self.residual = self._checked()
@@ -241,7 +252,8 @@ class BoundaryForces:
         nodes = self.grid.nodes
         mesh = self._base(nodes, s, F) + self._nodes.field(c)
         at = self._base(p, s, F) + self._columns(p) @ c
-        return mesh.reshape(len(nodes), 2, -1), at.reshape(len(p), 2, -1)
+        k = F.shape[1]
+        return mesh.reshape(len(nodes), 2, k), at.reshape(len(p), 2, k)
 
     @property
     def nearest(self) -> float:
@@ -276,6 +288,14 @@ class BoundaryForces:
         )
 
     # -- set-up ----------------------------------------------------------------------------------------------------
+
+    def _refuse_large(self) -> None:
+        """Refuse regions that would take longer to set up than a live solve, or whose matrix is too large."""
+        unknowns = sum(self._counts)
+        if len(self.bodies) > 1 and unknowns > MANY:
+            raise UnsuitedError(f"its edges and interfaces need {unknowns} unknowns, more than {MANY}")
+        if len(self.bodies) > 1 and 16 * self.grid.size * unknowns > LARGEST:
+            raise UnsuitedError(f"{self.grid.size} mesh nodes beside interfaces need more than {LARGEST / 1e6:.0f} MB")
 
     def _decomposed(self) -> tuple[Floats, Floats]:
         """Least squares of the conditions as two factors: by QR with pivoting, two to three times as fast as singular values."""
@@ -341,7 +361,7 @@ class BoundaryForces:
             own = where == q
             u = _summed(self.bodies[q].base, points[own], places, forces, self.radius)
             field[own] = u.reshape(-1, 2, forces.shape[1])
-        return field.reshape(2 * len(points), -1)
+        return field.reshape(2 * len(points), forces.shape[1])
 
     def _own(self, q: int, points: Floats) -> Floats:
         """Displacement by unit strengths of body q at points in it or on its boundary."""
@@ -519,16 +539,6 @@ def divide(tissue: Tissue, grid: RegularGrid) -> tuple[Partition, list[tuple[flo
     return partition, moduli
 
 
-def refuse_large(grid: RegularGrid, partition: Partition, spacing: float) -> None:
-    """Refuse regions on a mesh for which the matrix from interfaces to nodes would not fit."""
-    x0, x1, y0, y1 = grid.extent
-    along = [_round_count(c.radius, min(x1 - x0, y1 - y0) * INTERFACE) for c in partition.circles]
-    lines = (len(partition.depths) - 2) * 2 * (x1 - x0) / (min(x1 - x0, y1 - y0) * INTERFACE)
-    unknowns = 2 * ((x1 - x0 + 2 * (y1 - y0)) / spacing + 2 * sum(along) + lines)
-    if 8 * 2 * grid.size * unknowns > LARGEST:
-        raise UnsuitedError(f"{grid.size} mesh nodes beside interfaces need more than {LARGEST / 1e6:.0f} MB")
-
-
 def lay_out(
     scene: BoundaryForces, moduli: Sequence[tuple[float, float]], fine: float
 ) -> tuple[tuple[Body, ...], tuple[Piece, ...]]:
@@ -539,20 +549,24 @@ def lay_out(
     top, off, depths = kinds["top"], OUTSIDE * spacing, partition.depths
     ringed = top == "clamped"
     bands = len(depths) - 1
+    if bands > 1 and np.diff(depths).min() < THINNEST * fine:
+        raise UnsuitedError(f"a layer is thinner than {THINNEST * fine:.2g} mm")
     pieces, sources = [], []
     for q in range(bands):
         first, last = q == 0, q == bands - 1
+        step = min(spacing, (depths[q + 1] - depths[q]) / THIN)  # along the sides of this band
+        beside = OUTSIDE * step
         upper = (y0 - off if ringed else y0) if first else depths[q] - OUTSIDE * fine
         lower = y1 + off if last else depths[q + 1] + OUTSIDE * fine
-        side = _middles(upper, lower, spacing)
-        own = [np.stack([np.full(len(side), x), side], axis=1) for x in (x0 - off, x1 + off)]
-        for depth, step in ((upper, spacing if first else fine), (lower, spacing if last else fine)):
+        side = _middles(upper, lower, step)
+        own = [np.stack([np.full(len(side), x), side], axis=1) for x in (x0 - beside, x1 + beside)]
+        for depth, gap in ((upper, spacing if first else fine), (lower, spacing if last else fine)):
             if depth != y0 or not first:
-                line = _middles(x0 - off, x1 + off, step)
+                line = _middles(x0 - beside, x1 + beside, gap)
                 own.append(np.stack([line, np.full(len(line), depth)], axis=1))
         sources.append(own)
         for edge, x in (("left", x0), ("right", x1)):
-            line = _middles(depths[q], depths[q + 1], spacing / ROWS)
+            line = _middles(depths[q], depths[q + 1], step / ROWS)
             pieces.append(_straight(line, x, 0, -1.0 if edge == "left" else 1.0, (q,), kinds[edge]))
         if first and ringed:
             pieces.append(_straight(_middles(x0, x1, spacing / ROWS), y0, 1, -1.0, (q,), top))
