@@ -256,6 +256,16 @@ class BoundaryForces:
         return mesh.reshape(len(nodes), 2, k), at.reshape(len(p), 2, k)
 
     @property
+    def _pin(self) -> float:
+        """Radius of the blob whose centre yields to a force as a rigid pin of ``radius`` does, mm.
+
+        Far from it both are the same force; at the rim of a pin the mean displacement is (3 - 4 nu) ln(1 / r) + 1 / 2, at the
+        centre of a blob (3 - 4 nu) ln(1 / e) + 2 (1 - nu).
+        """
+        nu = self.bodies[0].base.nu
+        return self.radius * float(np.exp((1.5 - 2.0 * nu) / (3.0 - 4.0 * nu)))
+
+    @property
     def nearest(self) -> float:
         """Distance of a force from an edge or an interface below which the conditions there cannot follow it, mm."""
         return NEAREST * self.spacing
@@ -320,21 +330,21 @@ class BoundaryForces:
         M = np.vstack(blocks)
         pins = self.clamps.points
         if len(pins):
-            M = np.hstack([M, self._loaded(pins, check)])
+            M = np.hstack([M, self._loaded(pins, check, self._pin)])
             M = np.vstack([M, PIN * self._columns(pins)])
         return M
 
-    def _loaded(self, places: Floats, check: bool = False) -> Floats:
+    def _loaded(self, places: Floats, check: bool = False, radius: float | None = None) -> Floats:
         """What unit forces at places inside the tissue do to the conditions on pieces, shape (rows, 2 m)."""
-        blocks = []
+        blocks, radius = [], radius or self.radius
         for piece in self._pieces:
             points, normals = _where(piece, check)
             rows = []
             for q in piece.bodies:
                 base = self.bodies[q].base
-                u = base.displacement(points, places, self.radius) if piece.moves else None
+                u = base.displacement(points, places, radius) if piece.moves else None
                 t = (
-                    self._weight * base.traction(points, normals, places, self.radius)
+                    self._weight * base.traction(points, normals, places, radius)
                     if piece.pulls
                     else None
                 )
@@ -351,15 +361,16 @@ class BoundaryForces:
         strengths: Floats = -(right @ (left @ load))
         return strengths
 
-    def _base(self, points: Floats, places: Floats, forces: Floats) -> Floats:
+    def _base(self, points: Floats, places: Floats, forces: Floats, radius: float | None = None) -> Floats:
         """Closed form at points under load cases (2 m, k), shape (2 n, k)."""
+        radius = radius or self.radius
         if len(self.bodies) == 1:
-            return _summed(self.bodies[0].base, points, places, forces, self.radius)
+            return _summed(self.bodies[0].base, points, places, forces, radius)
         field = np.zeros((len(points), 2, forces.shape[1]))
         where = self.partition.locate(points)
         for q in np.unique(where):
             own = where == q
-            u = _summed(self.bodies[q].base, points[own], places, forces, self.radius)
+            u = _summed(self.bodies[q].base, points[own], places, forces, radius)
             field[own] = u.reshape(-1, 2, forces.shape[1])
         return field.reshape(2 * len(points), forces.shape[1])
 
@@ -397,7 +408,7 @@ class BoundaryForces:
         pins = self.clamps.points
         if not len(pins):
             return G
-        return np.hstack([G, self._base(points, pins, np.eye(2 * len(pins)))])
+        return np.hstack([G, self._base(points, pins, np.eye(2 * len(pins)), self._pin)])
 
     def _evaluation(self) -> _Dense | _Lattice:
         """Return what takes strengths to the field at the mesh nodes."""
@@ -408,7 +419,7 @@ class BoundaryForces:
         if len(x) * len(y) > 0.6 * self.grid.size:
             return _Dense(self._columns(self.grid.nodes))
         pins = self.clamps.points
-        own = self._base(self.grid.nodes, pins, np.eye(2 * len(pins))) if len(pins) else None
+        own = self._base(self.grid.nodes, pins, np.eye(2 * len(pins)), self._pin) if len(pins) else None
         lattice = np.stack([a.ravel() for a in np.meshgrid(x, y)], axis=1)
         along = _interpolation(x, self.grid.x), _interpolation(y, self.grid.y)
         return _Lattice(*along, self._own(0, lattice), own)
