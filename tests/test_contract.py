@@ -50,7 +50,7 @@ def force_model(kind, **lengths):
 MODELS = {
     "tps": landmark_model(ThinPlate()),
     "elastic": landmark_model(Elastic(0.45, 1.0)),
-    "green": force_model(GreenModel, radius=0.4, anchor_spacing=2.0, station_spacing=1.0),
+    "green": force_model(GreenModel, radius=0.4, station_spacing=1.0),
     "fem": force_model(FEMModel),
 }
 SCENES = {

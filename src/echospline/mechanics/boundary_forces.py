@@ -236,7 +236,7 @@ class BoundaryForces:
         # The softest band, for a traction missed there moves it most; a softer lesion must not outweigh everything else.
         self._weight = WEIGHT * short / min(b.base.stiffness for b in self.bodies[: len(self.partition.depths) - 1])
         self._solution = self._decomposed()
-        self._nodes = self._evaluation()
+        self._nodes, self._held = self._evaluation(), self._holds(grid.nodes)
         self.residual = self._checked()
 
     @property
@@ -253,7 +253,9 @@ class BoundaryForces:
         mesh = self._base(nodes, s, F) + self._nodes.field(c)
         at = self._base(p, s, F) + self._columns(p) @ c
         k = F.shape[1]
-        return mesh.reshape(len(nodes), 2, k), at.reshape(len(p), 2, k)
+        mesh, at = mesh.reshape(len(nodes), 2, k), at.reshape(len(p), 2, k)
+        mesh[self._held], at[self._holds(p)] = 0.0, 0.0
+        return mesh, at
 
     @property
     def _pin(self) -> float:
@@ -298,6 +300,21 @@ class BoundaryForces:
         )
 
     # -- set-up ----------------------------------------------------------------------------------------------------
+
+    def _holds(self, points: Floats) -> NDArray[np.bool_]:
+        """Which components of points are held because they lie on an edge, shape (n, 2).
+
+        There the conditions hold but for the residual, most of which is at the corners; the displacement is zero.
+        """
+        x0, x1, y0, y1 = self.grid.extent
+        held = np.zeros((len(points), 2), dtype=bool)
+        for edge in (*self.clamps.edges, *self.clamps.sliding):
+            axis, side = SIDES[edge]
+            on = np.abs(points[:, axis] - ((x0, x1), (y0, y1))[axis][side]) <= 1e-9 * max(x1 - x0, y1 - y0)
+            held[on, axis] = True
+            if edge in self.clamps.edges:
+                held[on] = True
+        return held
 
     def _refuse_large(self) -> None:
         """Refuse regions that would take longer to set up than a live solve, or whose matrix is too large."""

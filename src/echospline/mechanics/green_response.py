@@ -80,24 +80,25 @@ class GreenResponse:
         force: Floats = 1e-3 * young * self.radius * self.tissue.thickness / per
         return force
 
-    def warnings(self, places: Floats, forces: Floats) -> tuple[str, ...]:
+    def warnings(self, places: Floats, forces: Floats) -> dict[str, str]:
         """Say where forces (m, 2) or (m, 2, k) in N at places (m, 2) go beyond what the method is good for.
 
         Returns
         -------
-        tuple of str
-            One sentence for each limit that is passed: a force close to an edge or an interface, a force that folds tissue.
+        dict of str to str
+            One sentence for each limit that is passed: "near" where a force is close to an edge or an interface, "folding" where it
+            is more than tissue bears. Empty where nothing is to be said. A model gives each to `warnings.warn` once.
         """
         p = inside(self.grid, places, "places of forces")
         f = np.asarray(forces, dtype=np.float64).reshape(len(p), 2, -1)
         size = np.hypot(f[:, 0], f[:, 1]).max(axis=1, initial=0.0)
         acting = size > 0
-        said = []
+        said: dict[str, str] = {}
         if isinstance(self.solver, BoundaryForces) and acting.any():
             gap = self.solver.clearance(p[acting])
             if gap.min() < self.clearance:
                 x, y = p[acting][gap.argmin()]
-                said.append(
+                said["near"] = (
                     f"a force at ({x:.1f}, {y:.1f}) mm is {gap.min():.2g} mm from an edge or interface; Green's function "
                     f"({self.method}) is good from {self.clearance:.2g} mm: use method = \"solve\" or fem there"
                 )
@@ -105,11 +106,11 @@ class GreenResponse:
             share = size[acting] / self.bearable(p[acting])
             if share.max() > 1.0:
                 x, y = p[acting][share.argmax()]
-                said.append(
+                said["folding"] = (
                     f"a force of {size[acting][share.argmax()]:.2g} N at ({x:.1f}, {y:.1f}) mm is {share.max():.1f} times what tissue bears "
                     f"there without |grad u| above 1: lower the force, or raise Young's modulus, the thickness or the radius of {self.radius:g} mm"
                 )
-        return tuple(said)
+        return said
 
 
 def green_response(

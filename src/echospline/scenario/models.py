@@ -53,8 +53,8 @@ def build_model(
         forces = NeedleForces(**scenario.model.forces.model_dump())
         if kind == "fem":
             return FEMModel(grid, clamped, tissue, forces, clamped_points=points)
-        radius = scenario.model.green.radius
-        return GreenModel(grid, clamped, tissue, forces, clamped_points=points, radius=radius)
+        green = scenario.model.green.model_dump()
+        return GreenModel(grid, clamped, tissue, forces, clamped_points=points, **green)
     parameters = TPSParameters(**scenario.model.landmarks.model_dump())
     kernel: Kernel = ThinPlate()
     if kind == "elastic":

@@ -221,9 +221,12 @@ class ElasticSection(Section):
 
 
 class GreenSection(Section):
-    """Green's function of tissue under a free surface."""
+    """Green's function: how the tissue answers forces."""
 
     radius: Millimetres = Field(0.4, gt=0, le=50, description="length over which a force is spread, mm")
+    method: Literal["auto", "boundary", "regions", "solve"] = Field(
+        "auto", description="closed forms (homogeneous; layers and lesions), a live solve, or the first that is good"
+    )
 
 
 class ForceSection(Section):
