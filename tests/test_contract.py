@@ -55,9 +55,9 @@ def force_model(kind, law, **lengths):
 MODELS = {
     "tps": landmark_model(ThinPlate()),
     "elastic": landmark_model(Elastic(0.45, 1.0)),
-    "green": force_model(GreenModel, STICKING, radius=0.4, anchor_spacing=2.0),
+    "green": force_model(GreenModel, STICKING, radius=0.4),
     "fem": force_model(FEMModel, STICKING),
-    "green, viscous": force_model(GreenModel, VISCOUS, radius=0.4, anchor_spacing=2.0, station_spacing=1.0),
+    "green, viscous": force_model(GreenModel, VISCOUS, radius=0.4, station_spacing=1.0),
     "fem, viscous": force_model(FEMModel, VISCOUS),
 }
 SCENES = {

@@ -82,6 +82,7 @@ OPTIONS = (
     _landmark("anchor_spacing", "MM"),
     Option("--elastic-radius", "model.elastic.radius", "MM", None, "Model tps, elastic"),
     Option("--green-radius", "model.green.radius", "MM", None, "Model fem, green"),
+    Option("--green-method", "model.green.method", "auto|boundary|regions|solve", None, "Model fem, green"),
     Option("--tip-force", "model.forces.tip", "N", None, "Model fem, green"),
     Option("--law", "model.forces.law", "LAW", None, "Model fem, green"),
     Option("--friction-limit", "model.forces.friction_limit", "N/MM", None, "Model fem, green"),

@@ -60,14 +60,15 @@ def build_model(
             f"tissue.material = 'neo-hookean' is large deformation, which finite elements alone compute: choose model fem, or "
             f"material linear; got model {kind}"
         )
-    clamped, points = scenario.mesh.clamped, scenario.mesh.clamped_points
+    mesh = scenario.mesh
+    clamped, sliding, points = mesh.clamped, mesh.sliding, mesh.clamped_points
     if kind in ("fem", "green"):
         forces = _forces(scenario.model.forces)
         if kind == "fem":
-            linear = FEMModel(grid, clamped, tissue, forces, clamped_points=points)
+            linear = FEMModel(grid, clamped, tissue, forces, sliding=sliding, clamped_points=points)
             return NeoHookeanModel(linear) if neo_hookean else linear
-        radius = scenario.model.green.radius
-        return GreenModel(grid, clamped, tissue, forces, clamped_points=points, radius=radius)
+        green = scenario.model.green.model_dump()
+        return GreenModel(grid, clamped, tissue, forces, sliding=sliding, clamped_points=points, **green)
     parameters = TPSParameters(**scenario.model.landmarks.model_dump())
     kernel: Kernel = ThinPlate()
     if kind == "elastic":
@@ -75,9 +76,11 @@ def build_model(
         nu = tissue.poisson if section.poisson is None else section.poisson
         kernel = Elastic(nu, section.radius, tissue.plane)
     if kind in ("tps", "elastic"):
-        anchors = anchors_for(Clamps.of(grid, clamped, points), kernel, parameters.anchor_spacing)
+        anchors = anchors_for(Clamps.of(grid, clamped, points, sliding), kernel, parameters.anchor_spacing)
         stiffness = None if tissue.homogeneous else landmark_stiffness(tissue, grid, kernel, anchors)
-        return TPSModel(grid, clamped, parameters, kernel, clamped_points=points, stiffness=stiffness)
+        return TPSModel(
+            grid, clamped, parameters, kernel, sliding=sliding, clamped_points=points, stiffness=stiffness
+        )
     raise InputError(f"a model is one of {', '.join(MODELS)}; got {kind!r}")
 
 

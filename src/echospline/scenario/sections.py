@@ -115,7 +115,19 @@ class MeshSection(Section):
     clamped: list[Literal["top", "bottom", "left", "right"]] = Field(
         ["left", "right", "bottom"], description="edges held fast; top is the probe's face"
     )
+    sliding: list[Literal["top", "bottom", "left", "right"]] = Field(
+        ["top"],
+        description="edges that move along themselves alone: the skin under the probe; any other edge is free",
+    )
     clamped_points: list[Point] = Field(default=[], description="further points held fast, mm")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _clamped_top_does_not_slide(cls, given: Any) -> Any:
+        """Let a clamped edge not slide, where nothing is said of sliding edges."""
+        if isinstance(given, dict) and "sliding" not in given and isinstance(given.get("clamped"), list | tuple):
+            return {**given, "sliding": [edge for edge in ("top",) if edge not in given["clamped"]]}
+        return given
 
 
 def _look(name: str, description: str) -> Any:
@@ -226,9 +238,12 @@ class ElasticSection(Section):
 
 
 class GreenSection(Section):
-    """Green's function of tissue under a free surface."""
+    """Green's function: how the tissue answers forces."""
 
     radius: Millimetres = Field(0.4, gt=0, le=50, description="length over which a force is spread, mm")
+    method: Literal["auto", "boundary", "regions", "solve"] = Field(
+        "auto", description="closed forms (homogeneous; layers and lesions), a live solve, or the first that is good"
+    )
 
 
 class ForceSection(Section):

@@ -299,8 +299,9 @@ class ForceFields:
             u = self.model.factored.solve(loads)
             return tuple(interpolate(self.model.grid, u[..., i], points) for i in (0, 1))  # type: ignore[return-value]
         places, covered = self.model.stations(pose)
-        G = self.model.green.columns(points, np.vstack([places, pose.tip]) if pushes else places)
-        k = G.shape[1] // 2
-        axial = G[:, :k] * axis[0] + G[:, k:] * axis[1]
+        sources = np.vstack([places, pose.tip]) if pushes else places
+        unit = np.eye(len(sources))[:, None, :] * axis[:, None]
+        at = self.model.response.answer(sources, unit, points)[1]
+        axial = at.transpose(1, 0, 2).reshape(2 * len(points), len(sources))
         shaft = (axial[:, : len(places)] @ covered).reshape(2, -1).T
         return (axial[:, -1].reshape(2, -1).T if pushes else zero), shaft
