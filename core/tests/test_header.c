@@ -31,6 +31,7 @@ VALUE(TIP_POINT, 0);
 VALUE(TIP_NODE, 1);
 VALUE(FOLLOW, 0);
 VALUE(IMMEDIATE, 1);
+VALUE(STICK, 2);
 VALUE(PLANE_STRESS, 0);
 VALUE(PLANE_STRAIN, 1);
 VALUE(LEFT, 1);
@@ -63,7 +64,7 @@ VALUE(SHADOW, 8);
 #define SIZE(type, size) static_assert(sizeof(type) == size, #type)
 #define OFFSET(type, member, offset) static_assert(offsetof(type, member) == offset, #type "." #member)
 
-SIZE(echospline_scene_options, 224);
+SIZE(echospline_scene_options, 232);
 OFFSET(echospline_scene_options, struct_size, 0);
 OFFSET(echospline_scene_options, dimension, 4);
 OFFSET(echospline_scene_options, kernel, 8);
@@ -92,6 +93,7 @@ OFFSET(echospline_scene_options, clamped_point_count, 192);
 OFFSET(echospline_scene_options, stiffness, 200);
 OFFSET(echospline_scene_options, stiffness_count, 208);
 OFFSET(echospline_scene_options, contact_room, 216);
+OFFSET(echospline_scene_options, friction_speed, 224);
 
 SIZE(echospline_pose, 64);
 OFFSET(echospline_pose, entry, 0);

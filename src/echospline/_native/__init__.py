@@ -72,6 +72,7 @@ class Loading(IntEnum):
 
     FOLLOW = 0
     IMMEDIATE = 1
+    STICK = 2
 
 
 class Plane(IntEnum):
@@ -173,6 +174,7 @@ class SceneOptions(ctypes.Structure):
         ("stiffness", c_void_p),
         ("stiffness_count", c_int64),
         ("contact_room", c_int64),
+        ("friction_speed", c_double),
     ]
 
 

@@ -164,6 +164,7 @@ def load(
     alpha3: float,
     dt: float,
     travel: Floats | float,
+    most: float = inf,
 ) -> Floats:
     """New displacements of the landmarks in contact.
 
@@ -186,6 +187,8 @@ def load(
     travel : ndarray, shape (k,), or float
         Longest way that a point of the needle has moved meanwhile, mm; infinite is the printed law: at once f
         while there is friction, relaxation only without.
+    most : float
+        Displacement along the axis beyond which a landmark comes back as the needle travels, mm.
 
     Returns
     -------
@@ -196,7 +199,7 @@ def load(
     loading = (np.sign(f) * (f - along) > 0) | (np.isinf(travel) & (f != 0))
     relaxed = np.where(loading, along, relax(along, f, alpha3, dt))
     rested = q + (relaxed - along)[:, None] * axis
-    target = np.where(loading, f, relaxed)[:, None] * axis + side
+    target = np.clip(np.where(loading, f, relaxed), -most, most)[:, None] * axis + side
     return approach(rested, target, travel)
 
 

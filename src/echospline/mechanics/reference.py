@@ -145,7 +145,7 @@ class Reference:
         before = _at(pose.entry, pose.entry) if state.pose is None else state.pose
         parts = 1
         if self.parameters.loading != "immediate":
-            parts = max(1, min(MOST_SUBSTEPS, ceil(needle_travel(before, pose) / SUBSTEP)))
+            parts = max(1, min(MOST_SUBSTEPS, ceil(needle_travel(before, pose) / SUBSTEP - 1e-9)))
         held_back = state.held_back
         for part in range(1, parts + 1):
             there = pose if part == parts else _between(before, pose, part / parts)
@@ -164,7 +164,6 @@ class Reference:
         handled = on | (while_touched > 0)  # one that has just left was dragged until then
         q = state.q.copy()
         q[handled] = self._handled(state, handled, pose, before, dt, while_touched)
-        dragged = q.copy()
         tip = self._tip(old, state, q, pose, before, dt, travel)
         free = np.zeros_like(q[off])
         if off.any():
@@ -175,7 +174,7 @@ class Reference:
         displaced = state.q if old.tip is None else np.vstack([state.q, old.tip.q])
         relaxed = float(_lengths(displaced).max(initial=0.0)) * -expm1(-p.alpha3 * dt)
         limit = CALM * (travel + relaxed) + LET_GO
-        state, tip = self._hold_back(old, state, q, tip, limit, dragged, dt)
+        state, tip = self._hold_back(old, state, q, tip, limit, dt)
         return self._release(replace(state, pose=pose, tip=tip), off, free)
 
     def _ways(
@@ -218,15 +217,16 @@ class Reference:
         f = friction(distance, p.friction_speed if sticks else pose.speed, p.alpha1, p.alpha2, p.length)
         if p.loading != "immediate":
             f = yielding(f, self.clearance[np.searchsorted(self.lattice, state.contacts[which])])
-        if not sticks:
-            return load(q, f, side, axis, p.alpha3, dt, travel)
         # a shaft that hardly is in the tissue drags it no further than its own depth
+        most = inf if p.loading == "immediate" else pose.depth
+        if not sticks:
+            return load(q, f, side, axis, p.alpha3, dt, travel, most)
         moved = np.clip(float(np.subtract(pose.tip, before.tip) @ axis), -travel, travel)
-        return stick(q, np.minimum(np.abs(f), pose.depth), moved, side, axis, travel)
+        return stick(q, np.minimum(np.abs(f), most), moved, side, axis, travel)
 
     def _returned(self, q: Floats, free: Floats, dt: float, since: Floats, travel: float) -> Floats:
         """Return displacements of contacts that the needle has left, on their way to the field without them."""
-        share = np.divide(since, travel, out=np.ones_like(since), where=0.0 < travel < inf) if isfinite(travel) else np.ones_like(since)
+        share = since / travel if 0.0 < travel < inf else np.ones_like(since)
         left_over = np.exp(-self.parameters.alpha3 * dt * share)[:, None]
         return approach(free + (q - free) * left_over, free, since)
 
@@ -251,7 +251,6 @@ class Reference:
         q: Floats,
         tip: Tip | None,
         limit: float,
-        dragged: Floats,
         dt: float,
     ) -> tuple[TPSState, Tip | None]:
         """Move the landmarks to their new displacements, or as far that way as no node moves beyond the limit.
@@ -269,7 +268,7 @@ class Reference:
         stay = None if tip is None else replace(tip, q=self.displacement_at(old, tip.point[None])[0])
         rest = _zero(self._on_lattice(self._fit(new.contacts, new.q, stay)), was) - was
         if old.tip is not None and _lengths(rest).max(initial=0.0) > limit:
-            tip = self._leaving_tip(old.tip, new, dragged, dt, limit / CALM, drop=False)
+            tip = self._leaving_tip(old.tip, new, q, dt, limit / CALM, drop=False)
             stay = old.tip
             u = self._on_lattice(self._fit(new.contacts, q, tip))
             rest = np.zeros_like(rest)
