@@ -169,6 +169,8 @@ class Reference:
         if off.any():
             without = self._fit(state.contacts[on], q[on], tip)
             free = free if without is None else without(self.grid.nodes[state.contacts[off]])
+            if tip is not None:  # a contact that the tip replaces goes with it
+                free[self._on_tip(state.contacts[off], tip)] = tip.q
             q[off] = self._returned(q[off], free, dt, since_left[off], travel)
 
         displaced = state.q if old.tip is None else np.vstack([state.q, old.tip.q])
@@ -292,8 +294,12 @@ class Reference:
         keep, changed = np.ones(len(state.q), dtype=bool), 0.0
         for j in np.flatnonzero(close):
             keep[j] = False
-            rest = self._fit(state.contacts[keep], state.q[keep], state.tip)
-            without = 0.0 if rest is None else rest(self.grid.nodes[state.contacts[j]])[0]
+            if state.tip is not None and self._on_tip(state.contacts[j : j + 1], state.tip)[0]:
+                without = state.tip.q
+            else:
+                rest = self._fit(state.contacts[keep], state.q[keep], state.tip)
+                node = self.grid.nodes[state.contacts[j]]
+                without = np.zeros_like(node) if rest is None else rest(node)[0]
             change = float(_lengths(state.q[j] - without))
             keep[j] = changed + change > LET_GO
             changed += 0.0 if keep[j] else change
@@ -463,13 +469,18 @@ class Reference:
         landmarks = [self.anchors, self.grid.nodes[contacts]]
         moves = [np.zeros_like(self.anchors), q]
         if tip is not None:
-            apart = _lengths(landmarks[1] - tip.point) > SAME_PLACE  # a tip on a node speaks for it
+            apart = ~self._on_tip(contacts, tip)
             contacts = contacts[apart]
             landmarks = [self.anchors, landmarks[1][apart], tip.point[None]]
             moves = [moves[0], q[apart], tip.q[None]]
         return factor(self.kernel, np.vstack(landmarks), self._stiffness(contacts, tip)).solve(
             np.vstack(moves)
         )
+
+    def _on_tip(self, contacts: Nodes, tip: Tip) -> NDArray[np.bool_]:
+        """Which contacts the tip replaces as landmark, being in the same place."""
+        there: NDArray[np.bool_] = _lengths(self.grid.nodes[contacts] - tip.point) <= SAME_PLACE
+        return there
 
     def _stiffness(self, contacts: Nodes, tip: Tip | None) -> Floats | None:
         """Return the stiffness of anchors (infinite), contacts and tip."""
