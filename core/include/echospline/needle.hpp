@@ -103,6 +103,10 @@ inline double yielding(double f, double clearance) {
   const double near = clearance / reach, step = near * near * (3 - 2 * near);
   return f * step * step;
 }
+/// How far the tip pushes, mm, where friction is not at once: beside what is clamped it fades as friction does.
+inline double tip_push_yielding(const Interaction& p, double depth, double clearance) {
+  return yielding(smaller(p.sigma, depth), clearance);
+}
 /// Share of a displacement that is left after dt, equation (16).
 inline double kept(const Interaction& p, double dt) { return std::exp(-p.alpha3 * dt); }
 /// Move a displacement towards its target, by at most the travel.

@@ -478,7 +478,7 @@ class Tissue {
     }
     const TipKind kind = tip_kind(n, clearance, can_move);
     if (kind == none) return;
-    const double push = tip_push(p, n.depth, clearance);
+    const double push = p.immediate ? tip_push(p, n.depth, clearance) : tip_push_yielding(p, n.depth, clearance);
     if (kind == leaves) return leave_tip(left_over, n.travel, true, step);
     step.softness = scene.softness_near(place);
     response_.meet(scene.anchored.conditioned(place), tip_column_);
@@ -535,7 +535,7 @@ class Tissue {
     }
     fill(next_count_, step, [&](int64_t j) { return new_q_[j]; });
     const Vec<D> free = response_.at(tip_column_, q_);
-    const double push = tip_push(p, n.depth, clearance);
+    const double push = tip_push_yielding(p, n.depth, clearance);
     const double ahead = larger(smaller(dot(was, n.axis) + n.moved, push), dot(free, n.axis));
     const Vec<D> pushed = towards(was, ahead * n.axis + across(free, n.axis), n.travel);
     if (n.moved <= 0 && norm(pushed - free) <= LET_GO) return;

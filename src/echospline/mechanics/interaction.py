@@ -104,7 +104,7 @@ def approach(q: Floats, target: Floats, travel: Floats | float) -> Floats:
 
 
 def yielding(f: Floats, clearance: Floats) -> Floats:
-    """Displacement that friction asks for beside what is clamped, mm: it fades over five times itself.
+    """Displacement that friction or the tip asks for beside what is clamped, mm: it fades over five times itself.
 
     Tissue beside a clamp cannot follow. A landmark there that did would give the spline a slope at the clamp, which a thin plate
     carries far away; so the displacement begins with the fourth power of the distance, and grows by 0.4 mm per mm at most.
@@ -112,7 +112,7 @@ def yielding(f: Floats, clearance: Floats) -> Floats:
     Parameters
     ----------
     f : ndarray, shape (k,)
-        Displacement that friction asks for in the open, mm.
+        Displacement asked for in the open, mm.
     clearance : ndarray, shape (k,)
         Distance to what is clamped, mm.
     """

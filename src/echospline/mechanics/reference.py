@@ -371,7 +371,7 @@ class Reference:
         clearance = self.clamps.clearance(pose.tip)
         if p.sigma == 0.0 or (clearance <= 0.0 and (p.loading == "immediate" or p.tip == "node")):
             return None
-        push = tip_push(pose, p.sigma, clearance) * axis
+        push = self._push(pose, clearance) * axis
         advancing = pose.speed >= 0 and pose.depth >= ZERO_LENGTH
         if p.tip == "node":
             node = self.grid.nearest(pose.tip)
@@ -385,6 +385,13 @@ class Reference:
             return self._sticking_tip(old, new, q, pose, before, dt, travel)
         inside = advancing and clearance > SAME_PLACE
         return self._following_tip(old, new, q, pose, push if inside else None, dt, travel)
+
+    def _push(self, pose: Pose, clearance: float) -> float:
+        """How far the tip pushes the tissue ahead of it, mm; beside what is clamped it fades as friction does, or as printed."""
+        p = self.parameters
+        if p.loading == "immediate":
+            return tip_push(pose, p.sigma, clearance)
+        return float(yielding(np.array([min(p.sigma, pose.depth)]), np.array([clearance]))[0])
 
     def _sticking_tip(
         self, old: TPSState, new: TPSState, q: Floats, pose: Pose, before: Pose, dt: float, travel: float
@@ -411,7 +418,7 @@ class Reference:
         field = self._fit(new.contacts, q)
         free = np.zeros_like(point) if field is None else field(place)[0]
         was = self.displacement_at(old, place[None])[0] if tip is None else tip.q
-        push = tip_push(pose, self.parameters.sigma, clearance)
+        push = self._push(pose, clearance)
         ahead = max(min(float(was @ axis) + moved, push), float(free @ axis))
         pushed = approach(was[None], (ahead * axis + _across(free, axis))[None], travel)[0]
         if moved <= 0 and _lengths(pushed - free) <= LET_GO:
