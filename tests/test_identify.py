@@ -114,6 +114,40 @@ def test_least_distances_agree_with_a_general_optimiser(fem_truth):
     assert found.error.mae <= other.fun * (1 + 1e-5)
 
 
+@pytest.mark.parametrize("objective", ["mae", "rmse"])
+@pytest.mark.parametrize("kernel", [ThinPlate(), Elastic()], ids=["thin plate", "elastic"])
+def test_friction_is_never_negative(kernel, objective):
+    """Above a table alone everything moves along with the needle, and the free minimum asks for friction of the wrong sign."""
+    seen = observe(
+        FEMModel(GRID, ("bottom",), forces=NeedleForces(0.4, 1e-4, ramp=0.0)),
+        Insertion.straight((12, 0), 90, 20, 5),
+    )
+    edges = ("bottom",) if kernel.components == 2 else ("bottom", "left")
+    fields = SplineFields(TPSModel(GRID, edges, printed(), kernel), seen, delta=(1.5,), length=(4.0, 5.0))
+    values = identify(fields, objective, bootstrap=0).values
+    a1, a2, sigma = (values[n] for n in ("alpha1", "alpha2", "sigma"))
+    assert min(a1, a1 + a2 / 2, sigma) >= -1e-12
+
+    # and is the least there is: a general optimiser under the same bounds, from another start, finds none better
+    moved = distance(seen.displacement, 0 * seen.displacement) > 1e-9
+    A, b = fields.fields(values)[moved], seen.displacement[moved]
+    free = np.linalg.lstsq(A.reshape(-1, 3), b.ravel(), rcond=None)[0]
+    assert min(free[0], free[0] + free[1] / 2) < 0
+
+    def cost(x):
+        r2 = ((A @ x - b) ** 2).sum(axis=-1)
+        return float(np.sqrt(r2 + 1e-12).mean() if objective == "mae" else r2.mean())
+
+    bounds = [
+        {"type": "ineq", "fun": lambda x, row=row, low=low: row @ x - low}
+        for row, low in zip(*fields.least, strict=True)
+    ]
+    best = minimize(
+        cost, [0.05, 0.05, 0.5], method="SLSQP", constraints=bounds, options={"maxiter": 500, "ftol": 1e-12}
+    )
+    assert cost([a1, a2, sigma]) <= best.fun * (1 + 1e-4)
+
+
 def test_closed_form_is_no_worse_than_the_grid_and_needs_far_fewer_runs(fem_truth):
     seen = fem_truth.frames(np.array([4, 8, 12]))
     closed = identify(SplineFields(TPSModel(GRID, parameters=printed()), seen, delta=(2.0,)), bootstrap=0)

@@ -78,7 +78,7 @@ echospline_status check_choices(const echospline_scene_options& o, Message& m) {
   } choices[] = {{"kernel", o.kernel, ECHOSPLINE_ELASTIC},
                  {"precision", o.precision, ECHOSPLINE_DOUBLE},
                  {"tip", o.tip, ECHOSPLINE_TIP_NODE},
-                 {"loading", o.loading, ECHOSPLINE_IMMEDIATE},
+                 {"loading", o.loading, ECHOSPLINE_STICK},
                  {"plane", o.plane, ECHOSPLINE_PLANE_STRAIN}};
   for (const auto& choice : choices)
     if (choice.value < 0 || choice.value > choice.last)
@@ -108,6 +108,7 @@ echospline_status check_numbers(const echospline_scene_options& o, Message& m) {
                           {"alpha3", o.alpha3, 0, huge, "1/s"},
                           {"length", o.length, 1e-9, huge, "mm"},
                           {"drag", o.drag, 0, 1, "(no unit)"},
+                          {"friction_speed", o.friction_speed, 0, huge, "mm/s"},
                           {"contact_spacing", o.contact_spacing, 0, huge, "mm"},
                           {"anchor_spacing", o.anchor_spacing, 1e-3, huge, "mm"},
                           {"poisson", o.poisson, 0, stress ? 0.5 : 0.4999999, "(no unit)"},
@@ -239,6 +240,7 @@ void echospline_scene_defaults(echospline_scene_options* o) {
   o->clamped = ECHOSPLINE_LEFT | ECHOSPLINE_RIGHT | ECHOSPLINE_BOTTOM;
   if (dimension == 3) o->clamped |= ECHOSPLINE_FRONT | ECHOSPLINE_BACK;
   o->sigma = 1, o->delta = 1.5, o->alpha1 = 0.08, o->alpha2 = 0.04, o->alpha3 = 1, o->length = 1, o->drag = 1;
+  o->loading = ECHOSPLINE_STICK, o->friction_speed = 10;
   o->contact_spacing = 1.25, o->anchor_spacing = dimension == 2 ? 1.5 : 5;
   o->poisson = 0.45, o->radius = 1;
 }

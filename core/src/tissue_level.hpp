@@ -274,7 +274,9 @@ struct Kind {
                          o.alpha3,
                          o.length,
                          o.drag,
+                         o.friction_speed,
                          o.loading == ECHOSPLINE_IMMEDIATE,
+                         o.loading == ECHOSPLINE_STICK,
                          o.tip == ECHOSPLINE_TIP_NODE};
     made->contact_room = o.contact_room > 0 ? o.contact_room : FIRST_ROOM;
     made->fingerprint = fingerprint(o);
@@ -309,7 +311,7 @@ struct Kind {
   static uint64_t fingerprint(const echospline_scene_options& o) {
     const int32_t choices[] = {o.dimension, o.kernel, o.tip, o.loading, o.plane, static_cast<int32_t>(o.clamped)};
     const double numbers[] = {o.sigma, o.delta,           o.alpha1,         o.alpha2,  o.alpha3, o.length,
-                              o.drag,  o.contact_spacing, o.anchor_spacing, o.poisson, o.radius};
+                              o.drag,  o.contact_spacing, o.anchor_spacing, o.poisson, o.radius, o.friction_speed};
     uint64_t sum = checksum(choices, sizeof choices);
     sum = checksum(numbers, sizeof numbers, sum);
     sum = checksum(o.shape, D * static_cast<int64_t>(sizeof *o.shape), sum);

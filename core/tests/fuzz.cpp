@@ -131,7 +131,7 @@ class Session {
     o.kernel = choices_.whole(0, 1);
     o.precision = choices_.whole(0, 1);
     o.tip = choices_.whole(0, 1);
-    o.loading = choices_.whole(0, 1);
+    o.loading = choices_.whole(0, 2);
     o.plane = choices_.whole(0, 1);
     if (choices_.below(4) == 0) o.clamped = choices_.byte();
     if (choices_.below(4) == 0) o.sliding = choices_.byte() & (choices_.below(4) ? ~o.clamped : ~0u);
@@ -144,7 +144,7 @@ class Session {
     }
     o.anchor_spacing = choices_.number(2, 9);
     double* numbers[] = {&o.sigma,  &o.delta, &o.alpha1,          &o.alpha2, &o.alpha3,
-                         &o.length, &o.drag,  &o.contact_spacing, &o.radius};
+                         &o.length, &o.drag,  &o.contact_spacing, &o.radius, &o.friction_speed};
     for (double* number : numbers)
       if (choices_.below(8) == 0) *number = choices_.number(0, 2);
     if (choices_.below(8) == 0) o.poisson = choices_.number(0, 0.5);

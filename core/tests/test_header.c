@@ -32,6 +32,7 @@ VALUE(TIP_POINT, 0);
 VALUE(TIP_NODE, 1);
 VALUE(FOLLOW, 0);
 VALUE(IMMEDIATE, 1);
+VALUE(STICK, 2);
 VALUE(PLANE_STRESS, 0);
 VALUE(PLANE_STRAIN, 1);
 VALUE(LEFT, 1);
@@ -64,7 +65,7 @@ VALUE(SHADOW, 8);
 #define SIZE(type, size) static_assert(sizeof(type) == size, #type)
 #define OFFSET(type, member, offset) static_assert(offsetof(type, member) == offset, #type "." #member)
 
-SIZE(echospline_scene_options, 232);
+SIZE(echospline_scene_options, 240);
 OFFSET(echospline_scene_options, struct_size, 0);
 OFFSET(echospline_scene_options, dimension, 4);
 OFFSET(echospline_scene_options, kernel, 8);
@@ -95,6 +96,7 @@ OFFSET(echospline_scene_options, stiffness_count, 208);
 OFFSET(echospline_scene_options, contact_room, 216);
 OFFSET(echospline_scene_options, sliding, 224);
 OFFSET(echospline_scene_options, reserved, 228);
+OFFSET(echospline_scene_options, friction_speed, 232);
 
 SIZE(echospline_pose, 64);
 OFFSET(echospline_pose, entry, 0);

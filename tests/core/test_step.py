@@ -40,7 +40,7 @@ def assert_same_landmarks(state, session, within):
 
 
 CASES = list(
-    product((2, 3), ("thin plate", "elastic"), ("follow", "immediate"), ("point", "node"), (False, True))
+    product((2, 3), ("thin plate", "elastic"), ("stick", "follow", "immediate"), ("point", "node"), (False, True))
 )
 
 

@@ -99,7 +99,7 @@ class Session:
         o.sliding = sum(core.Edge[name.upper()] for name in given.clamps.sliding)
         for name in ("shape", "spacing", "origin"):
             getattr(o, name)[: self.dimension] = getattr(given.grid, name)
-        for name in ("sigma", "delta", "alpha1", "alpha2", "alpha3", "length", "drag"):
+        for name in ("sigma", "delta", "alpha1", "alpha2", "alpha3", "length", "drag", "friction_speed"):
             setattr(o, name, getattr(p, name))
         o.contact_spacing, o.anchor_spacing = p.contact_spacing, p.anchor_spacing
         solid = given.kernel if isinstance(given.kernel, Elastic) else Elastic()

@@ -22,7 +22,7 @@ namespace Echospline
 
     public enum Tip { TipPoint = 0, TipNode = 1 }
 
-    public enum Loading { Follow = 0, Immediate = 1 }
+    public enum Loading { Follow = 0, Immediate = 1, Stick = 2 }
 
     public enum Plane { PlaneStress = 0, PlaneStrain = 1 }
 
@@ -109,6 +109,7 @@ namespace Echospline
         public long ContactRoom;
         public Edge Sliding;
         public uint Reserved;
+        public double FrictionSpeed;
 
         /// <summary>The core's own defaults; shape and spacing have to be set.</summary>
         public static SceneOptions Defaults()

@@ -35,6 +35,7 @@ struct Scene {
   AnchoredKernel<D> anchored;
   Array<double> stiffness;  ///< per node; empty: infinite
   Array<Vec<D>> source;     ///< rest position of every source, mm
+  Array<double> clearance;  ///< distance of every source to what is clamped, mm; beside a sliding edge tissue can follow
   SceneField<D>* field = nullptr;
   int64_t contact_room = 0;
   uint64_t fingerprint = 0;  ///< of everything that a state depends on
@@ -61,8 +62,11 @@ struct Scene {
       case AnchoredKernel<D>::not_held: return not_held;
       case AnchoredKernel<D>::ready: break;
     }
-    if (!lattice.build(grid, clamps, contact_spacing) || !source.reserve(lattice.node.size())) return no_memory;
-    for (int64_t i = 0; i < sources(); ++i) source[i] = grid.place(lattice.node[i]);
+    if (!lattice.build(grid, clamps, contact_spacing) || !source.reserve(lattice.node.size()) ||
+        !clearance.reserve(lattice.node.size()))
+      return no_memory;
+    for (int64_t i = 0; i < sources(); ++i)
+      source[i] = grid.place(lattice.node[i]), clearance[i] = clamps.clearance(grid, source[i], Vec<D>{});
     field = field_for(*this);
     return field ? ready : no_memory;
   }

@@ -73,6 +73,7 @@ class Loading(IntEnum):
 
     FOLLOW = 0
     IMMEDIATE = 1
+    STICK = 2
 
 
 class Plane(IntEnum):
@@ -176,6 +177,7 @@ class SceneOptions(ctypes.Structure):
         ("contact_room", c_int64),
         ("sliding", c_uint32),
         ("reserved", c_uint32),
+        ("friction_speed", c_double),
     ]
 
 

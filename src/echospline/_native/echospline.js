@@ -17,7 +17,7 @@ export const Level = Object.freeze({
 export const Kernel = Object.freeze({ THIN_PLATE: 0, ELASTIC: 1 });
 export const Precision = Object.freeze({ SINGLE: 0, DOUBLE: 1 });
 export const Tip = Object.freeze({ TIP_POINT: 0, TIP_NODE: 1 });
-export const Loading = Object.freeze({ FOLLOW: 0, IMMEDIATE: 1 });
+export const Loading = Object.freeze({ FOLLOW: 0, IMMEDIATE: 1, STICK: 2 });
 export const Plane = Object.freeze({ PLANE_STRESS: 0, PLANE_STRAIN: 1 });
 export const Edge = Object.freeze({ LEFT: 1, RIGHT: 2, TOP: 4, BOTTOM: 8, FRONT: 16, BACK: 32 });
 export const PixelType = Object.freeze({ UINT8: 0, UINT16: 1, INT16: 2, FLOAT32: 3 });
@@ -39,7 +39,7 @@ export const LandmarkKind = Object.freeze({ CONTACT: 0, LEAVING: 1, TIP: 2, TIP_
  *   clamped?: number, level?: number, shape?: Numbers, spacing?: Numbers, origin?: Numbers, sigma?: number,
  *   delta?: number, alpha1?: number, alpha2?: number, alpha3?: number, length?: number, drag?: number,
  *   contact_spacing?: number, anchor_spacing?: number, poisson?: number, radius?: number, clamped_points?: Numbers,
- *   stiffness?: Numbers, contact_room?: number, sliding?: number
+ *   stiffness?: Numbers, contact_room?: number, sliding?: number, friction_speed?: number
  * }} SceneOptions
  */
 /**
@@ -120,7 +120,7 @@ export const LAYOUTS = Object.freeze({
     ["alpha2", "f64"], ["alpha3", "f64"], ["length", "f64"], ["drag", "f64"], ["contact_spacing", "f64"],
     ["anchor_spacing", "f64"], ["poisson", "f64"], ["radius", "f64"], ["clamped_points", "pointer"],
     ["clamped_point_count", "i64"], ["stiffness", "pointer"], ["stiffness_count", "i64"], ["contact_room", "i64"],
-    ["sliding", "u32"], ["reserved", "u32"],
+    ["sliding", "u32"], ["reserved", "u32"], ["friction_speed", "f64"],
   ]),
   echospline_pose: layout([["entry", "f64", 3], ["tip", "f64", 3], ["speed", "f64"], ["dt", "f64"]]),
   echospline_command: layout([["entry", "f64", 3], ["tip", "f64", 3], ["lag", "f64"], ["fastest", "f64"]]),

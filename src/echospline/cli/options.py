@@ -78,6 +78,7 @@ OPTIONS = (
     _landmark("drag", "0..1"),
     _landmark("tip", "point|node"),
     _landmark("loading", "LAW"),
+    _landmark("friction_speed", "MM_S"),
     _landmark("contact_spacing", "MM"),
     _landmark("anchor_spacing", "MM"),
     Option("--elastic-radius", "model.elastic.radius", "MM", None, "Model tps, elastic"),

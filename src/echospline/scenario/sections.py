@@ -219,8 +219,16 @@ class LandmarkSection(Section):
         1.0, ge=0, le=1, description="sideways motion that tissue follows, 0 (paper) to 1 (bonded)"
     )
     tip: Literal["point", "node"] = Field("point", description="landmark at the tip, or nearest node (paper)")
-    loading: Literal["follow", "immediate"] = Field(
-        "follow", description="friction grows with the needle's motion, or at once (paper)"
+    loading: Literal["stick", "follow", "immediate"] = Field(
+        "stick",
+        description="tissue sticks to the shaft and slips, or follows friction and relaxes at rest (paper's (16), (17)), or has it "
+        "at once (paper)",
+    )
+    friction_speed: Speed = Field(
+        10.0,
+        ge=0,
+        le=1e3,
+        description="speed at which (15) says how far friction holds tissue that sticks, mm/s",
     )
     contact_spacing: Millimetres = Field(
         1.25, ge=0, le=50, description="between contacts, mm; 0 takes every node"

@@ -92,8 +92,13 @@ class UnitFields(Protocol):
         ...
 
     @property
-    def linear(self) -> Mapping[str, float]:
-        """Parameters in which the field is linear, with their lower bounds."""
+    def linear(self) -> Sequence[str]:
+        """Parameters in which the field is linear, p names."""
+        ...
+
+    @property
+    def least(self) -> tuple[Floats, Floats]:
+        """Combinations of the linear parameters that have lower bounds, an invertible (p, p), and those bounds, (p,)."""
         ...
 
     @property
@@ -169,7 +174,12 @@ class SplineFields:
                 f"got {p.loading!r}, {p.drag} and {p.tip!r}"
             )
         self.model, self.observation = model, observation
-        self.linear: dict[str, float] = {"alpha1": -np.inf, "alpha2": -np.inf, "sigma": 1e-3}
+        self.linear = ("alpha1", "alpha2", "sigma")
+        # friction, equation (15), lies between alpha1 far from the shaft and alpha1 + alpha2 / 2 at it: neither is negative
+        self.least = (
+            np.array([[1.0, 0.0, 0.0], [1.0, 0.5, 0.0], [0.0, 0.0, 1.0]]),
+            np.array([0.0, 0.0, 1e-3]),
+        )
         self.search = {"length": length} | ({"alpha3": alpha3} if observation.rests else {})
         self.levels = {"delta": tuple(delta)}
         self._scene = AnchoredKernel.factor(
@@ -274,7 +284,8 @@ class ForceFields:
         alpha3: tuple[float, float] = (0.01, 20.0),
     ) -> None:
         self.model, self.observation = model, observation
-        self.linear: dict[str, float] = {"tip": 0.0, "friction": 0.0}
+        self.linear = ("tip", "friction")
+        self.least = (np.eye(2), np.zeros(2))
         self.search = {"alpha3": alpha3} if observation.rests else {}
         self.levels: dict[str, tuple[float, ...]] = {}
         unit = [self._unit(pose) for pose in observation.poses]
