@@ -17,7 +17,7 @@
 namespace echospline::ECHOSPLINE_CORE {
 
 constexpr int MOST_STATIONS = 512;      // of a track: 640 mm at the usual spacing
-constexpr int MOST_SUBSTEPS = 400;      // of a step; a needle that jumps further is solved in longer ones
+constexpr int MOST_SLIP_SUBSTEPS = 400;      // of a step; a needle that jumps further is solved in longer ones
 constexpr int MOST_REPEATS = 20;        // solutions of a substep, while front, cover and displacement come to agree
 constexpr double AGREED = 1e-7;         // mm; front and cover agree when they change by less
 constexpr double LEAST_CONTACT = 1e-9;  // mm; a piece that is covered less than this is not touched
@@ -270,7 +270,7 @@ class SlipTissue {
       length = std::fmax(0.0, dot(from - state.contacts[0].place - state.contacts[0].moved, axis0));
     const double travel = std::fmax(norm(acting - from), norm(acting - length * axis - from + length * axis0));
     const double parts = std::ceil(travel / law.substep - 1e-9);
-    const int64_t count = parts > MOST_SUBSTEPS ? MOST_SUBSTEPS : parts > 1 ? static_cast<int64_t>(parts) : 1;
+    const int64_t count = parts > MOST_SLIP_SUBSTEPS ? MOST_SLIP_SUBSTEPS : parts > 1 ? static_cast<int64_t>(parts) : 1;
     const double start = std::atan2(axis0[1], axis0[0]), pi = 3.14159265358979323846;
     double turn = std::fmod(std::atan2(axis[1], axis[0]) - start + pi, 2 * pi);
     turn = (turn < 0 ? turn + 2 * pi : turn) - pi;
