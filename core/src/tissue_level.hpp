@@ -295,10 +295,11 @@ struct Kind {
     const int64_t count = outcome == SceneOf::not_held ? anchored.held_by(anchored.loose) : 0;
     const char* flat = D == 2 ? "line" : "plane";
     if (anchored.systems > 1)
-      std::snprintf(message.text, sizeof message.text,
-                    "what is held must determine the field; along %c the %lld anchors lie on one %s or are too few: clamp "
-                    "an edge, or let one that is normal to %c slide",
-                    "xyz"[anchored.loose], static_cast<long long>(count), flat, "xyz"[anchored.loose]);
+      std::snprintf(
+          message.text, sizeof message.text,
+          "what is held must determine the field; along %c the %lld anchors lie on one %s or are too few: clamp "
+          "an edge, or let one that is normal to %c slide",
+          "xyz"[anchored.loose], static_cast<long long>(count), flat, "xyz"[anchored.loose]);
     else
       std::snprintf(message.text, sizeof message.text,
                     "the %lld anchors along what is held must determine the field; they lie on one %s or are too few: "

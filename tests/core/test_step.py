@@ -174,10 +174,7 @@ def test_sliding_edges_give_the_numbers_of_algorithm_2(dimension, edges, kernel,
     where = np.arange(0, len(nodes), 1 if dimension == 2 else 23)
     for step, pose in enumerate(handling(2, scene.grid, DT)):
         state = oracle.advance(state, pose, DT)
-        if dimension == 3 and step % 4:
-            expected = None
-        else:
-            expected = oracle.displacement_at(state, nodes[where])
+        expected = None if dimension == 3 and step % 4 else oracle.displacement_at(state, nodes[where])
         for precision, session in sessions.items():
             session.advance(pose, DT)
             assert_same_landmarks(state, session, WITHIN[precision])

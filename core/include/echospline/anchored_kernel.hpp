@@ -202,8 +202,7 @@ struct AnchoredKernel {
         double* rows = L + own.first * ld;
         for (int64_t i = own.count; i-- > 1;) add(rows + i * ld, -1, rows + own.parent[i] * ld, ld);
         for (int64_t j = held_by(loose); j < order(loose); ++j)
-          for (int64_t i = own.count; i-- > 1;)
-            L[j * ld + own.first + i] -= L[j * ld + own.first + own.parent[i]];
+          for (int64_t i = own.count; i-- > 1;) L[j * ld + own.first + i] -= L[j * ld + own.first + own.parent[i]];
       }
       if (!invert(L, order(loose), ld, pivots.data())) return not_held;
     }

@@ -268,9 +268,7 @@ class FieldOf final : public SessionField<D> {
   Real* column(int64_t block_index, int64_t slot) {
     return columns_.data() + (block_index * (room_ + 1) + slot) * c * planes_of * block;
   }
-  const Real* table(int64_t block_index) const {
-    return given_.table.data() + block_index * table_rows_ * block;
-  }
+  const Real* table(int64_t block_index) const { return given_.table.data() + block_index * table_rows_ * block; }
 
   /// Mesh displacement in planes: the field itself, or the fine one from it.
   __attribute__((noinline)) const Planes<D, Real>& mesh_planes(const LandmarkWeights<D>& landmarks) {
@@ -351,8 +349,7 @@ class FieldOf final : public SessionField<D> {
           for (int d = 0; d < planes_of; ++d, t += block)
             for (int v = 0; v < VECTORS; ++v) {
               const N value = load_as<Number>(t + v * lanes);
-              for (int e = s; e < (apart ? s + 1 : c); ++e)
-                a[e][d][v] -= static_cast<Number>(held[e * ld + i]) * value;
+              for (int e = s; e < (apart ? s + 1 : c); ++e) a[e][d][v] -= static_cast<Number>(held[e * ld + i]) * value;
             }
       Real* out = column(b, slot) + within;
       for (int e = 0; e < c; ++e)

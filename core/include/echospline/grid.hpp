@@ -9,7 +9,7 @@
 namespace echospline::ECHOSPLINE_CORE {
 
 constexpr double SAME_ANCHOR = 1e-6;  // mm; anchors closer than this are one
-constexpr double ALONG = 1e9;  // mm; a sliding edge further away than this along the needle is not ahead of it
+constexpr double ALONG = 1e9;         // mm; a sliding edge further away than this along the needle is not ahead of it
 
 /// Points at constant spacing, x fastest.
 template <int D>

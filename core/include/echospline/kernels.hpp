@@ -19,7 +19,7 @@ ECHOSPLINE_INLINE double inverse_root(double x) { return 1 / std::sqrt(x); }
 template <int D>
 struct ThinPlate {
   static constexpr int components = 1;
-  static constexpr bool scalar = true;  ///< one number at an offset serves all components
+  static constexpr bool scalar = true;                 ///< one number at an offset serves all components
   static constexpr int motions = D + 1;                ///< polynomials
   static constexpr int length_power = D == 2 ? 2 : 1;  ///< of the kernel's values
   static constexpr double per_spring = D == 2 ? 16 * PI : 8 * PI;

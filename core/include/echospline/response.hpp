@@ -150,8 +150,7 @@ class Response {
     const double* places[D];
     for (int d = 0; d < D; ++d) places[d] = across[d].data();
     double* U = tip.Pg.data();  // until P g is known
-    for (int e = 0; e < c; ++e)
-      anchored_->kernel.along(anchored_->kernel, e, p, places, count, U + e * count, ldk);
+    for (int e = 0; e < c; ++e) anchored_->kernel.along(anchored_->kernel, e, p, places, count, U + e * count, ldk);
     for (int a = 0; a < c; ++a)
       for (int64_t j = 0; j < count; ++j)
         for (int e = 0; e < c; ++e)

@@ -35,11 +35,11 @@ struct Weights {
   const double* carried = nullptr;  ///< weights of their kept columns, as `Sides`
   int64_t ld = 0;                   ///< of `carried`
   bool tip = false;                 ///< whether there is a tip with a column of its own
-  Vec<D> place{}, s{};           ///< of the tip, conditioned; its weight
-  Bases<D> base;                 ///< that its column is relative to
-  const double* held = nullptr;  ///< L_B^-1 [U P]' of the tip less that of its bases
-  bool at_rest = false;          ///< into the field at rest instead of the next one
-  LandmarkWeights<D> landmarks;  ///< where the field needs them
+  Vec<D> place{}, s{};              ///< of the tip, conditioned; its weight
+  Bases<D> base;                    ///< that its column is relative to
+  const double* held = nullptr;     ///< L_B^-1 [U P]' of the tip less that of its bases
+  bool at_rest = false;             ///< into the field at rest instead of the next one
+  LandmarkWeights<D> landmarks;     ///< where the field needs them
 };
 
 /// The field of one session. Functions that a class behind this one does not replace are never called.

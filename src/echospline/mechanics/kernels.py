@@ -206,23 +206,24 @@ class Apart:
 
     def matrix(self, points: Floats, sources: Floats) -> Floats:
         """U(r) for every component, no component acting on another, shape (D n, D m)."""
-        matrix: Floats = np.kron(np.eye(self.dimension), self.plate.matrix(points, sources))
-        return matrix
+        return self._each(self.plate.matrix(points, sources))
 
     def gradient(self, points: Floats, sources: Floats) -> Floats:
         """Derivatives of `matrix` by the coordinates, shape (D, D n, D m)."""
-        return np.stack([np.kron(np.eye(self.dimension), by) for by in self.plate.gradient(points, sources)])
+        return np.stack([self._each(by) for by in self.plate.gradient(points, sources)])
 
     def polynomial(self, points: Floats) -> Floats:
         """Affine motions of every component, shape (D n, D (D + 1))."""
-        motions: Floats = np.kron(np.eye(self.dimension), self.plate.polynomial(points))
-        return motions
+        return self._each(self.plate.polynomial(points))
 
     def polynomial_gradient(self, points: Floats) -> Floats:
         """Return the derivatives of the affine motions, shape (D, D n, D (D + 1))."""
-        return np.stack(
-            [np.kron(np.eye(self.dimension), by) for by in self.plate.polynomial_gradient(points)]
-        )
+        return np.stack([self._each(by) for by in self.plate.polynomial_gradient(points)])
+
+    def _each(self, block: Floats) -> Floats:
+        """Blocks along a diagonal, one per component."""
+        blocks: Floats = np.kron(np.eye(self.dimension), block).astype(np.float64, copy=False)
+        return blocks
 
 
 @dataclass(frozen=True)

@@ -244,7 +244,7 @@ class Clamps:
         order = np.argsort(first)
         return Anchors(landmarks[first[order]], together[order])
 
-    def clearance(self, point: Sequence[float], axis: Sequence[float]) -> float:
+    def clearance(self, point: Sequence[float], axis: Sequence[float] | Floats) -> float:
         """Distance in mm over which a needle can push; 0 at what is held and beyond it; infinite where nothing is.
 
         It is the distance from the tip to what is clamped. A sliding edge stops no more than the part of a push along its
@@ -268,7 +268,7 @@ class Clamps:
                 steep = abs(float(axis[d]))
                 gap = gap / steep if gap < ALONG * steep else inf
             distances.append(gap)
-        distances += [np.linalg.norm(p - point) for p in self.points]
+        distances += [float(np.linalg.norm(p - point)) for p in self.points]
         return max(0.0, float(min(distances, default=inf)))
 
     def _holds(self, edge: str) -> NDArray[np.bool_]:
