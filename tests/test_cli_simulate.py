@@ -80,8 +80,24 @@ def test_the_resolved_scenario_gives_the_same_numbers(done, tmp_path):
 
 
 def test_forces_are_printed_reported_and_recorded(tmp_path):
-    words = ("--model", "fem", "--mesh", "12x10", "--depth", "6", "--dwell", "0", "--no-retract", "--fps", "5", "--formats", "mha")
-    answer = echospline("simulate", "sample:calf", "--out", str(tmp_path), "--no-figure", "--dead-band", "0.1", *words)
+    words = (
+        "--model",
+        "fem",
+        "--mesh",
+        "12x10",
+        "--depth",
+        "6",
+        "--dwell",
+        "0",
+        "--no-retract",
+        "--fps",
+        "5",
+        "--formats",
+        "mha",
+    )
+    answer = echospline(
+        "simulate", "sample:calf", "--out", str(tmp_path), "--no-figure", "--dead-band", "0.1", *words
+    )
     assert answer.returncode == 0, answer.stderr
     report = json.loads((tmp_path / "run.json").read_text())
     loads = read_displacement(tmp_path / "displacement.npz").loads

@@ -243,8 +243,10 @@ def test_forces_are_recorded_for_every_frame_or_for_none(tmp_path: Path) -> None
         writer.add(still, 0.0, at)
         with pytest.raises(InputError, match="every frame or for none"):
             writer.add(still, 1.0, at, loads[0])
-        with pytest.raises(InputError, match="force of the needle at 1.0 s is not finite"):
-            DisplacementWriter(tmp_path / "c.npz", mesh.nodes).add(still, 1.0, at, loads[0] | {"cut_mm": np.nan})
+        with pytest.raises(InputError, match=r"force of the needle at 1\.0 s is not finite"):
+            DisplacementWriter(tmp_path / "c.npz", mesh.nodes).add(
+                still, 1.0, at, loads[0] | {"cut_mm": np.nan}
+            )
     assert read_displacement(tmp_path / "b.npz").loads == {}
 
 

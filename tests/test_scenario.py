@@ -218,14 +218,16 @@ def test_the_law_of_forces_is_the_one_named_or_that_of_an_old_files_numbers():
         return build_model(scene, grid).forces
 
     assert law() == NeedleForces()
-    assert law(friction_limit="0.02 N/mm", dead_band=0.15) == NeedleForces(friction_limit=0.02, dead_band=0.15)
+    assert law(friction_limit="0.02 N/mm", dead_band=0.15) == NeedleForces(
+        friction_limit=0.02, dead_band=0.15
+    )
     assert law(law="viscous") == ViscousForces(friction=1e-3)
     assert law(tip=0.3, friction=2e-3, ramp=0.0) == ViscousForces(0.3, 2e-3, ramp=0.0)
 
 
 def test_a_number_of_the_viscous_law_is_refused_by_the_other():
     scene = validated({"model": {"kind": "fem"}}, "test")
-    with pytest.raises(InputError, match='model.forces.ramp belongs to the viscous law .* "viscous" too'):
+    with pytest.raises(InputError, match=r'model\.forces\.ramp belongs to the viscous law .* "viscous" too'):
         scene.with_values({"model.forces.ramp": 0.0})
     changed = scene.with_values({"model.forces.ramp": 0.0, "model.forces.law": "viscous"})
     assert changed.model.forces.ramp == 0.0

@@ -22,7 +22,9 @@ class GreenResponse:
                 "Green's function is that of homogeneous tissue; for tissue with regions use finite elements (fem)"
             )
         if clamps.sliding:
-            raise InputError("Green's function does not know sliding edges yet; clamp the edge or leave it free")
+            raise InputError(
+                "Green's function does not know sliding edges yet; clamp the edge or leave it free"
+            )
         self._grid = grid
         self.green = GreensFunction(
             clamps.anchors(spacing), tissue.young, tissue.poisson, tissue.thickness, tissue.plane, radius,

@@ -206,9 +206,7 @@ def advance(
     if axis is None or depth < ZERO_LENGTH:  # it has no direction and touches nothing
         return replace(_released(state), tip=tip, depth=0.0)
     if state.axis is None or state.axis @ axis < 0:  # the first, or drawn out and turned
-        state = replace(
-            _released(state), axis=axis, tip=np.asarray(pose.entry, dtype=np.float64), depth=0.0
-        )
+        state = replace(_released(state), axis=axis, tip=np.asarray(pose.entry, dtype=np.float64), depth=0.0)
     assert state.axis is not None
     acting = _play(state.tip, tip, axis, law.dead_band)
     length = _length_inside(state)
