@@ -79,6 +79,34 @@ def test_the_resolved_scenario_gives_the_same_numbers(done, tmp_path):
     np.testing.assert_array_equal(read(out / "cine.mha").frames, read(tmp_path / "cine.mha").frames)
 
 
+def test_forces_are_printed_reported_and_recorded(tmp_path):
+    words = (
+        "--model",
+        "fem",
+        "--mesh",
+        "12x10",
+        "--depth",
+        "6",
+        "--dwell",
+        "0",
+        "--no-retract",
+        "--fps",
+        "5",
+        "--formats",
+        "mha",
+    )
+    answer = echospline(
+        "simulate", "sample:calf", "--out", str(tmp_path), "--no-figure", "--dead-band", "0.1", *words
+    )
+    assert answer.returncode == 0, answer.stderr
+    report = json.loads((tmp_path / "run.json").read_text())
+    loads = read_displacement(tmp_path / "displacement.npz").loads
+    assert f"largest tip force {loads['tip_force_N'].max():.3f} N" in answer.stdout
+    assert report["largest_forces"] == {name: np.abs(values).max() for name, values in loads.items()}
+    assert 0.3 < loads["tip_force_N"].max() <= 0.4
+    assert loads["tip_force_N"][0] == 0
+
+
 def test_a_picture_of_ones_own_with_spacing(tmp_path):
     Image.fromarray(np.random.default_rng(0).integers(0, 255, (80, 100), np.uint8)).save(tmp_path / "my.png")
     answer = echospline(

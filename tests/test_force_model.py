@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 
 from echospline.errors import InputError
-from echospline.mechanics import FEMModel, ForceModel, GreenModel, ThinPlate, TPSModel, ViscousForces, force_model
+from echospline.mechanics import (
+    FEMModel,
+    ForceModel,
+    GreenModel,
+    ThinPlate,
+    TPSModel,
+    ViscousForces,
+    force_model,
+)
 from echospline.mechanics.protocol import needle_load
 from echospline.scene import Insertion, NeedlePose, RegularGrid, Tissue
 from forced_paths import GRID, depths, model, pose, response
@@ -48,7 +56,7 @@ def test_states_share_the_columns_of_their_stations():
         assert states[-1].track[k].columns is a.columns
 
 
-@pytest.mark.parametrize("ahead", [1, 3, 9])
+@pytest.mark.parametrize("ahead", [2, 4, 9])
 def test_the_number_of_columns_computed_at_once_changes_nothing(monkeypatch, ahead):
     expected = depths(model(), IN)[-1]
     monkeypatch.setattr(force_model, "AHEAD", ahead)
@@ -92,7 +100,9 @@ def test_a_step_that_is_refused_leaves_the_model_as_it_was():
     with pytest.raises(InputError, match="below 1e9"):
         made.advance(half, pose(1e12), 0.1)
     expected = depths(model(), IN)[-1]
-    np.testing.assert_allclose(depths(made, IN[40:], state=half)[-1].displacement, expected.displacement, atol=1e-12)
+    np.testing.assert_allclose(
+        depths(made, IN[40:], state=half)[-1].displacement, expected.displacement, atol=1e-12
+    )
 
 
 def test_states_of_another_law_solver_or_mesh_are_refused():
@@ -130,16 +140,56 @@ def test_every_model_of_forces_says_them_and_landmarks_say_none():
 
 GOLDEN = {  # of the version before forces stuck and slipped
     "FEMModel": [
-        0.127719884929, 0.618007832166, 0.26453399633, 0.775627306752, 0.257951497227, 0.324737613028,
-        0.0909838806217, 0.420906263617, 0.169047224074, 0.494557865968, 0.158181893536, 0.329185519929,
-        -0.0333397516686, -0.109999148534, -0.0472358258359, -0.0895602340467, -0.0289589062082, -0.0374374721851,
-        -0.0307091498905, -0.0906282484721, -0.0363925946114, -0.070967087251, -0.0238307921358, -0.0314849042499,
+        0.127719884929,
+        0.618007832166,
+        0.26453399633,
+        0.775627306752,
+        0.257951497227,
+        0.324737613028,
+        0.0909838806217,
+        0.420906263617,
+        0.169047224074,
+        0.494557865968,
+        0.158181893536,
+        0.329185519929,
+        -0.0333397516686,
+        -0.109999148534,
+        -0.0472358258359,
+        -0.0895602340467,
+        -0.0289589062082,
+        -0.0374374721851,
+        -0.0307091498905,
+        -0.0906282484721,
+        -0.0363925946114,
+        -0.070967087251,
+        -0.0238307921358,
+        -0.0314849042499,
     ],
     "GreenModel": [
-        0.126034999146, 0.620025074897, 0.257870924982, 0.764746436514, 0.260411582244, 0.324785009371,
-        0.0900963976795, 0.420386486702, 0.167816332276, 0.491364749277, 0.155152862472, 0.332174247883,
-        -0.0314506170081, -0.105408296583, -0.0448840804078, -0.0838843182928, -0.027047100023, -0.0344107910635,
-        -0.0197156863384, -0.0426110177801, -0.0154879842671, -0.0292416998182, -0.0100957252652, -0.013482320232,
+        0.126034999146,
+        0.620025074897,
+        0.257870924982,
+        0.764746436514,
+        0.260411582244,
+        0.324785009371,
+        0.0900963976795,
+        0.420386486702,
+        0.167816332276,
+        0.491364749277,
+        0.155152862472,
+        0.332174247883,
+        -0.0314506170081,
+        -0.105408296583,
+        -0.0448840804078,
+        -0.0838843182928,
+        -0.027047100023,
+        -0.0344107910635,
+        -0.0197156863384,
+        -0.0426110177801,
+        -0.0154879842671,
+        -0.0292416998182,
+        -0.0100957252652,
+        -0.013482320232,
     ],
 }
 

@@ -9,10 +9,10 @@ from echospline.mechanics import (
     Elastic,
     FEMModel,
     GreenModel,
-    ViscousForces,
     ThinPlate,
     TPSModel,
     TPSParameters,
+    ViscousForces,
 )
 from echospline.scene import Insertion, RegularGrid, Tissue, distance, field_error
 from echospline.study import ForceFields, Observation, SplineFields, identify

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from echospline.errors import InputError
-from echospline.mechanics import TPSParameters
+from echospline.mechanics import NeedleForces, TPSParameters, ViscousForces
 from echospline.picture import NeedleEcho
 from echospline.scenario import MODELS, Scenario, build_model, describe, load, validated
 from echospline.scenario.sections import LandmarkSection
@@ -208,3 +208,26 @@ def test_any_tree_is_a_scenario_or_an_input_error(tree):
     except InputError:
         return
     assert isinstance(scenario, Scenario)
+
+
+def test_the_law_of_forces_is_the_one_named_or_that_of_an_old_files_numbers():
+    grid = RegularGrid((6, 5), (8.0, 8.0))
+
+    def law(**table):
+        scene = validated({"model": {"kind": "fem", "forces": table}}, "test")
+        return build_model(scene, grid).forces
+
+    assert law() == NeedleForces()
+    assert law(friction_limit="0.02 N/mm", dead_band=0.15) == NeedleForces(
+        friction_limit=0.02, dead_band=0.15
+    )
+    assert law(law="viscous") == ViscousForces(friction=1e-3)
+    assert law(tip=0.3, friction=2e-3, ramp=0.0) == ViscousForces(0.3, 2e-3, ramp=0.0)
+
+
+def test_a_number_of_the_viscous_law_is_refused_by_the_other():
+    scene = validated({"model": {"kind": "fem"}}, "test")
+    with pytest.raises(InputError, match=r'model\.forces\.ramp belongs to the viscous law .* "viscous" too'):
+        scene.with_values({"model.forces.ramp": 0.0})
+    changed = scene.with_values({"model.forces.ramp": 0.0, "model.forces.law": "viscous"})
+    assert changed.model.forces.ramp == 0.0

@@ -1,6 +1,7 @@
 """Forces that stick, slip and cut: closed forms on rigid tissue, energy, repetition, noise, speed and time step."""
 
 from dataclasses import fields, replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -17,7 +18,11 @@ from echospline.scene import Insertion, NeedlePose
 from forced_paths import GRID, depths, largest, model, pose, response
 
 LAW = NeedleForces()
-QUICK = [Phase.explicit, Phase.reuse, Phase.generate]  # the reference takes tens of ms a step: a failure is not made smaller
+QUICK = [
+    Phase.explicit,
+    Phase.reuse,
+    Phase.generate,
+]  # the reference takes tens of ms a step: a failure is not made smaller
 
 
 class Rigid:
@@ -122,9 +127,11 @@ def test_work_is_stored_or_lost_and_never_created(corners, young):
     made = model(young=young, solver="reference")
     state, before, work, kept = made.rest(), (0.0, np.pi / 2, np.array([20.0, 0.0])), 0.0, 0.0
     path = np.array([(0.0, 0.0, 0.0), *corners, (0.0, 0.0, 0.0)])
-    for first, last in zip(path[:-1], path[1:], strict=True):
+    for first, last in pairwise(path):
         way = last - first
-        for k in range(1, (n := int(np.ceil(max(abs(way[0]), 0.4 * abs(way[1]), abs(way[2])) / 0.25)) or 1) + 1):
+        for k in range(
+            1, (n := int(np.ceil(max(abs(way[0]), 0.4 * abs(way[1]), abs(way[2])) / 0.25)) or 1) + 1
+        ):
             depth, tilt, shift = first + way * k / n
             at = pose(depth, 90 + tilt, 20 + shift)
             state = made.advance(state, at, 0.01)
@@ -280,11 +287,15 @@ def test_a_needle_outside_the_tissue_exerts_nothing():
 @settings(max_examples=6, deadline=None, phases=QUICK)
 @given(
     st.lists(
-        st.tuples(st.floats(-5, 7), st.floats(-8, 8), st.floats(-1, 1), st.floats(0, 0.2)), min_size=2, max_size=6
+        st.tuples(st.floats(-5, 7), st.floats(-8, 8), st.floats(-1, 1), st.floats(0, 0.2)),
+        min_size=2,
+        max_size=6,
     ),
     st.sampled_from([0.0, 3.0, 28.0]),
     st.sampled_from([2.0, 10.0, 50.0]),
-    st.sampled_from([LAW, replace(LAW, viscosity=5e-4, dead_band=0.1), replace(LAW, tip=0.0, friction_limit=0.03)]),
+    st.sampled_from(
+        [LAW, replace(LAW, viscosity=5e-4, dead_band=0.1), replace(LAW, tip=0.0, friction_limit=0.03)]
+    ),
 )
 def test_core_and_reference_agree_on_any_path(steps, depth, young, law):
     tissue = response(young)
@@ -330,7 +341,14 @@ def test_the_slower_ways_reach_what_guessing_reaches(monkeypatch, left_out):
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"tip": -1.0}, {"friction_limit": np.nan}, {"bond": 0.0}, {"substep": 0.0}, {"station_spacing": -1.0}, {"dead_band": -0.1}],
+    [
+        {"tip": -1.0},
+        {"friction_limit": np.nan},
+        {"bond": 0.0},
+        {"substep": 0.0},
+        {"station_spacing": -1.0},
+        {"dead_band": -0.1},
+    ],
 )
 def test_a_parameter_out_of_its_range_is_named_with_its_unit(wrong):
     with pytest.raises(InputError, match=rf"{next(iter(wrong))} must be .* in (N|mm)"):
@@ -338,5 +356,5 @@ def test_a_parameter_out_of_its_range_is_named_with_its_unit(wrong):
 
 
 def test_stations_too_close_for_the_tissue_are_refused():
-    with pytest.raises(InputError, match="station_spacing must be 0.1 mm or more"):
+    with pytest.raises(InputError, match=r"station_spacing must be 0\.1 mm or more"):
         model(replace(LAW, station_spacing=0.05))
