@@ -99,7 +99,8 @@ def test_halving_dt_changes_nothing_in_relaxation():
 
 def test_at_rest_the_field_keeps_its_shape_and_fades():
     path = Insertion.straight((8, 0), 40, 25, 8.0, dwell=3.0)
-    for model in (TPSModel(GRID), TPSModel(GRID, solver="refit")):
+    follow = TPSParameters(loading="follow")
+    for model in (TPSModel(GRID, parameters=follow), TPSModel(GRID, parameters=follow, solver="refit")):
         state = model.advance(drive(model, path, 1 / 40, duration=3.125), path.pose(3.2), 0.0)
         before, after = model.displacement(state), []
         for _ in range(4):
@@ -109,7 +110,7 @@ def test_at_rest_the_field_keeps_its_shape_and_fades():
             np.testing.assert_allclose(u, before * np.exp(-0.5 * (k + 1)), atol=1e-6)
 
 
-@pytest.mark.parametrize("loading", ["follow", "immediate"])
+@pytest.mark.parametrize("loading", ["stick", "follow", "immediate"])
 def test_rest_after_a_push_does_not_depend_on_the_frame_rate(loading):
     parameters = TPSParameters(loading=loading)
     model = TPSModel(GRID, parameters=parameters, precision="double")
@@ -127,8 +128,7 @@ def test_a_finer_step_approaches_one_answer():
     path = Insertion.straight((12, 0), 60, 15, 5.0)
     u = [model.displacement(drive(model, path, dt)) for dt in (1 / 30, 1 / 60, 1 / 240)]
     coarse, fine = (np.abs(v - u[2]).max() for v in u[:2])
-    assert fine < 0.75 * coarse
-    assert coarse < 0.2  # mm, of a largest displacement above 1 mm
+    assert max(coarse, fine) < 0.01  # mm, of a largest displacement of 1 mm
 
 
 @pytest.mark.parametrize(("precision", "within"), [("double", 1e-9), ("single", 5e-6)])
@@ -167,7 +167,7 @@ def test_withdrawal_drags_tissue_back_and_leaves_it_at_rest_in_the_end():
 def test_tilting_drags_the_tissue_sideways_as_far_as_drag_says():
     turned = []
     for drag in (0.0, 1.0):
-        model = TPSModel(GRID, parameters=TPSParameters(drag=drag))
+        model = TPSModel(GRID, parameters=TPSParameters(drag=drag, loading="follow"))
         state = drive(model, Insertion.straight((20, 0), 90, 15, 5.0), 1 / 30)
         for k in range(20):
             angle = np.radians(90 - 0.5 * (k + 1))
