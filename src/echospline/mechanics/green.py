@@ -103,9 +103,7 @@ class GreenModel:
             raise InputError(f"station_spacing must be a positive number in mm; got {station_spacing}")
         self.station_spacing = station_spacing
         clamps = Clamps.of(grid, clamped, clamped_points, sliding)
-        self.response: GreenResponse = green_response(
-            grid, clamps, self.tissue, radius=radius, method=method
-        )
+        self.response: GreenResponse = green_response(grid, clamps, self.tissue, radius=radius, method=method)
         self._warned: set[str] = set()
 
     @property

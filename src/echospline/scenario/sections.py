@@ -225,7 +225,8 @@ class GreenSection(Section):
 
     radius: Millimetres = Field(0.4, gt=0, le=50, description="length over which a force is spread, mm")
     method: Literal["auto", "boundary", "regions", "solve"] = Field(
-        "auto", description="closed forms (homogeneous; layers and lesions), a live solve, or the first that is good"
+        "auto",
+        description="closed forms (homogeneous; layers and lesions), a live solve, or the first that is good",
     )
 
 
