@@ -80,6 +80,11 @@ def quadratic(extent, h):
     return Quadratic(extent, h)
 
 
+@lru_cache(maxsize=2)
+def _uniform(extent, h, *moduli):
+    return quadratic(extent, h).stiffness(*moduli)
+
+
 def needle(entry, angle, depth, tip=0.4, friction=5e-3, per_mm=2.0):
     """Places (m, 2) and forces (m, 2) of a needle: friction (N/mm) at the middles of short pieces, and the tip's force."""
     axis = np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])
@@ -90,10 +95,13 @@ def needle(entry, angle, depth, tip=0.4, friction=5e-3, per_mm=2.0):
 
 
 def truth(extent, h, nodes, poses, young=10.0, poisson=0.45, plane="stress", thickness=40.0, **held):
-    """Displacement (poses, n, 2) of nodes under needles; ``young`` and ``poisson`` numbers or functions of points."""
+    """Displacement (poses, n, 2) of nodes under needles; ``young`` and ``poisson`` both numbers or both functions of points."""
     model = quadratic(extent, h)
-    E, nu = (m(model.centres) if callable(m) else m for m in (young, poisson))
-    solve = model.solver(model.stiffness(E, nu, thickness, plane), **held)
+    if callable(young):
+        K = model.stiffness(young(model.centres), poisson(model.centres), thickness, plane)
+    else:
+        K = _uniform(extent, h, young, poisson, thickness, plane)
+    solve = model.solver(K, **held)
     loads = np.stack([model.loads(*pose) for pose in poses], axis=1)
     return (model.probes(nodes) @ solve(loads)).T.reshape(len(poses), len(nodes), 2)
 

@@ -75,7 +75,9 @@ class GreenResponse:
         elasticity has long stopped being good.
         """
         young, poisson = self.tissue.at(places) if len(places) else (np.zeros(0), np.zeros(0))
-        steep = {float(nu): HalfPlane.of(self.tissue, 1.0, float(nu), None).steepest for nu in np.unique(poisson)}
+        steep = {
+            float(nu): HalfPlane.of(self.tissue, 1.0, float(nu), None).steepest for nu in np.unique(poisson)
+        }
         per = np.array([steep[float(nu)] for nu in poisson])
         force: Floats = 1e-3 * young * self.radius * self.tissue.thickness / per
         return force
@@ -100,7 +102,7 @@ class GreenResponse:
                 x, y = p[acting][gap.argmin()]
                 said["near"] = (
                     f"a force at ({x:.1f}, {y:.1f}) mm is {gap.min():.2g} mm from an edge or interface; Green's function "
-                    f"({self.method}) is good from {self.clearance:.2g} mm: use method = \"solve\" or fem there"
+                    f'({self.method}) is good from {self.clearance:.2g} mm: use method = "solve" or fem there'
                 )
         if acting.any():
             share = size[acting] / self.bearable(p[acting])

@@ -210,7 +210,10 @@ class HalfPlane:
         xy, yx = both + swap, both - swap
         if radius:
             share = radius * radius / (2.0 * b)
-            up, side = 4.0 * y * (even * d + odd * x), 4.0 * y * (even * x - odd * d)  # 4 y Im, 4 y Re of w^3 / |w|^6
+            up, side = (
+                4.0 * y * (even * d + odd * x),
+                4.0 * y * (even * x - odd * d),
+            )  # 4 y Im, 4 y Re of w^3 / |w|^6
             xx, yy = xx + share * (a * even - up), yy - share * (a * even + up)
             xy, yx = xy - share * (a * odd + side), yx - share * (a * odd - side)
         return xx, yy, xy, yx

@@ -60,7 +60,10 @@ class QuadraticSolve:
         x0, x1, y0, y1 = grid.extent
         if not (x1 > x0 and y1 > y0):
             raise InputError(f"tissue needs a mesh of 2 x 2 nodes or more; got {grid.shape}")
-        if tissue.plane == "strain" and not max(tissue.poisson, *(r.poisson for r in tissue.regions), 0) < 0.5:
+        if (
+            tissue.plane == "strain"
+            and not max(tissue.poisson, *(r.poisson for r in tissue.regions), 0) < 0.5
+        ):
             raise InputError("Poisson's ratio in plane strain must be below 0.5")
         self._grid, self.radius = grid, radius
         self.step = float(np.sqrt((x1 - x0) * (y1 - y0) / CELLS))
@@ -150,7 +153,9 @@ class QuadraticSolve:
         double = (corners[:, 1, 0] - corners[:, 0, 0]) * (corners[:, 2, 1] - corners[:, 0, 1]) - (
             corners[:, 2, 0] - corners[:, 0, 0]
         ) * (corners[:, 1, 1] - corners[:, 0, 1])
-        slope = np.stack([edges[..., 1], -edges[..., 0]], axis=-1) / double[:, None, None]  # of area coordinates
+        slope = (
+            np.stack([edges[..., 1], -edges[..., 0]], axis=-1) / double[:, None, None]
+        )  # of area coordinates
         Ke = np.zeros((len(triangles), 6, 2, 6, 2))
         weight = 1e-3 * tissue.thickness * np.abs(double) / 6.0
         for q in np.eye(3) / 2 + 1 / 6:  # three points integrate a quadratic exactly
@@ -190,11 +195,10 @@ class QuadraticSolve:
         turned = (i + j) % 2 == 1
         second = np.where(turned, s + t > 1, t > s)
         triangle = self._triangles()[2 * (j * (len(self.x) - 1) + i) + second]
-        one = np.select(
-            [turned & ~second, turned & second, ~second], [1 - s - t, 1 - t, 1 - s], 1 - t
-        )
+        one = np.select([turned & ~second, turned & second, ~second], [1 - s - t, 1 - t, 1 - s], 1 - t)
         two = np.select([turned & ~second, turned & second, ~second], [s, s + t - 1, s - t], s)
         L = np.stack([one, two, 1 - one - two], axis=1)
+        L[np.abs(L) < 1e-12] = 0.0  # rounding: a point on an edge has no share of the nodes off it
         values = np.concatenate([L * (2 * L - 1), 4 * L * np.roll(L, -1, axis=1)], axis=1)
         rows = np.repeat(np.arange(len(points)), 6)
         return sparse.csr_matrix((values.ravel(), (rows, triangle.ravel())), shape=(len(points), self._count))
@@ -225,7 +229,9 @@ def _moduli(tissue: Tissue, corners: Floats) -> tuple[Floats, Floats]:
     E, nu = (v.reshape(len(corners), -1) for v in tissue.at(points))
     mu = E / (2 * (1 + nu))
     lam = E * nu / ((1 + nu) * (1 - 2 * nu)) if tissue.plane == "strain" else E * nu / (1 - nu**2)
-    return np.exp(np.log(lam).mean(axis=1)) if (lam > 0).all() else lam.mean(axis=1), np.exp(np.log(mu).mean(axis=1))
+    return np.exp(np.log(lam).mean(axis=1)) if (lam > 0).all() else lam.mean(axis=1), np.exp(
+        np.log(mu).mean(axis=1)
+    )
 
 
 def _parts(count: int) -> Floats:

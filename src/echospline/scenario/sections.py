@@ -125,7 +125,11 @@ class MeshSection(Section):
     @classmethod
     def _clamped_top_does_not_slide(cls, given: Any) -> Any:
         """Let a clamped edge not slide, where nothing is said of sliding edges."""
-        if isinstance(given, dict) and "sliding" not in given and isinstance(given.get("clamped"), list | tuple):
+        if (
+            isinstance(given, dict)
+            and "sliding" not in given
+            and isinstance(given.get("clamped"), list | tuple)
+        ):
             return {**given, "sliding": [edge for edge in ("top",) if edge not in given["clamped"]]}
         return given
 
@@ -250,7 +254,8 @@ class GreenSection(Section):
 
     radius: Millimetres = Field(0.4, gt=0, le=50, description="length over which a force is spread, mm")
     method: Literal["auto", "boundary", "regions", "solve"] = Field(
-        "auto", description="closed forms (homogeneous; layers and lesions), a live solve, or the first that is good"
+        "auto",
+        description="closed forms (homogeneous; layers and lesions), a live solve, or the first that is good",
     )
 
 
