@@ -103,7 +103,7 @@ def edges():
     for left, right, top, bottom in product(("clamped", "sliding", "free"), repeat=4):
         if left > right:
             continue
-        kinds = dict(left=left, right=right, top=top, bottom=bottom)
+        kinds = {"left": left, "right": right, "top": top, "bottom": bottom}
         clamped, sliding = (
             tuple(e for e, k in kinds.items() if k == kind) for kind in ("clamped", "sliding")
         )

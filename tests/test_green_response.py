@@ -76,7 +76,7 @@ def test_traction_is_hooke_s_law_of_the_displacement(top, radius):
 def test_conditions_hold_on_the_top():
     line = np.stack([np.linspace(-5, 9, 8), np.full(8, 4.0)], axis=1)
     up = np.tile((0.0, -1.0), (8, 1))
-    sources = SOURCES + (0, 4)
+    sources = SOURCES + np.array([0.0, 4.0])
     u, t = {}, {}
     for top in TOPS[1:]:
         form = tissue_below(top, 4.0)
@@ -350,7 +350,7 @@ def test_auto_says_what_it_chose_and_why():
 )
 def test_regions_refuses_what_it_cannot_represent_and_auto_solves(regions):
     tissue, box = Tissue(regions=regions), Clamps.of(GRID, BOX)
-    with pytest.raises(InputError, match="cannot hold this tissue.*solve"):
+    with pytest.raises(InputError, match=r"cannot hold this tissue.*solve"):
         green_response(GRID, box, tissue, method="regions")
     assert green_response(GRID, box, tissue).method == "solve"
 

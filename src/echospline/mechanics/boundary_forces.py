@@ -453,7 +453,7 @@ class BoundaryForces:
         M = self._conditions(check=True)[: -2 * len(self.clamps.points) or None]
         missed = np.abs(M @ c + self._loaded(places, check=True)).mean(axis=0)
         # Points between the forces: a force's own blob would make the mean displacement depend on its radius.
-        at = places + (0.37 * (x1 - x0) / 4, 0.29 * (y1 - y0) / 3)
+        at = places + np.array([0.37 * (x1 - x0) / 4, 0.29 * (y1 - y0) / 3])
         moved = np.hypot(
             *(self._base(at, places, F) + self._columns(at) @ c).reshape(len(at), 2, -1).transpose(1, 0, 2)
         )
@@ -486,7 +486,7 @@ class _Lattice:
         k = strengths.shape[1]
         coarse = (self.columns @ strengths[:own]).reshape(self.along_y.shape[1], self.along_x.shape[1], 2 * k)
         rows = np.tensordot(self.along_y, coarse, axes=(1, 0))  # mesh rows, lattice columns
-        fine = np.matmul(self.along_x, rows).reshape(-1, k)
+        fine: Floats = np.matmul(self.along_x, rows).reshape(-1, k)
         return fine if self.pins is None else fine + self.pins @ strengths[own:]
 
 
@@ -578,7 +578,7 @@ def lay_out(
     """Place forces outside every part of the tissue and conditions along its edges and interfaces."""
     x0, x1, y0, y1 = scene.grid.extent
     partition, spacing = scene.partition, scene.spacing
-    kinds = {edge: scene.clamps.kind(edge) for edge in EDGES}
+    kinds: dict[str, Kind] = {edge: scene.clamps.kind(edge) for edge in EDGES}
     top, off, depths = kinds["top"], OUTSIDE * spacing, partition.depths
     ringed = top == "clamped"
     bands = len(depths) - 1
@@ -706,7 +706,7 @@ def _interpolation(points: Floats, wanted: Floats) -> Floats:
     gap = wanted[:, None] - points[None]
     hit = np.abs(gap) < 1e-12 * (points[-1] - points[0])
     terms = w / np.where(hit, 1.0, gap)
-    A = terms / terms.sum(axis=1, keepdims=True)
+    A: Floats = terms / terms.sum(axis=1, keepdims=True)
     rows = hit.any(axis=1)
     A[rows] = hit[rows]
     return A

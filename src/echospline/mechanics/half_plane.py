@@ -253,11 +253,12 @@ class HalfPlane:
         w: NDArray[np.complex128] = 1.0 / (dx + 1j * (y + c))
         T = np.empty((len(normals), 2, dx.shape[1], 2))
         for j, F in enumerate((1.0, 1j)):
-            G = np.conj(F)
+            G = complex(F).conjugate()
             first = (a * F * w - 2j * c * G * w**2 - 2.0 * e2 * G * w**3) / b
             second = (-a * F * w**2 + 4j * c * G * w**3 + 6.0 * e2 * G * w**4) / b
             t = 2.0 * first.real * n + (
                 np.conj(first) + b * F * np.conj(w) - 2j * y * np.conj(second)
             ) * np.conj(n)
             T[:, 0, :, j], T[:, 1, :, j] = t.real, t.imag
-        return T / (2.0 * pi * (1.0 + a))
+        traction: Floats = T / (2.0 * pi * (1.0 + a))
+        return traction

@@ -7,6 +7,7 @@ spread over the same blob as in the closed form, as consistent loads of twelve p
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -270,10 +271,7 @@ def _lines(low: float, high: float, fixed: list[float], step: float) -> Floats:
     for line in [*fixed, high]:
         if line - kept[-1] > 1e-6 * step:
             kept.append(line)
-    pieces = [
-        np.linspace(a, b, max(1, round((b - a) / step)) + 1)[:-1]
-        for a, b in zip(kept[:-1], kept[1:], strict=True)
-    ]
+    pieces = [np.linspace(a, b, max(1, round((b - a) / step)) + 1)[:-1] for a, b in pairwise(kept)]
     lines: Floats = np.append(np.concatenate(pieces), high)
     return lines
 
