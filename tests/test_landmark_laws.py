@@ -209,7 +209,9 @@ def test_a_needle_along_a_clamped_edge_throws_nothing(kernel, law, side):
 
 
 @pytest.mark.parametrize(("kernel", "law"), MODELS)
-@pytest.mark.parametrize(("entry", "angle", "depth"), [((20, 5), 20, 26), ((22, 0), 45, 30), ((14, 0), 75, 34)])
+@pytest.mark.parametrize(
+    ("entry", "angle", "depth"), [((20, 5), 20, 26), ((22, 0), 45, 30), ((14, 0), 75, 34)]
+)
 def test_withdrawal_through_a_clamped_side_is_as_calm_as_finite_elements(kernel, law, entry, angle, depth):
     path = Insertion.straight(entry, angle, depth, 8.0, dwell=0.5, retract=True)
 

@@ -40,7 +40,9 @@ def assert_same_landmarks(state, session, within):
 
 
 CASES = list(
-    product((2, 3), ("thin plate", "elastic"), ("stick", "follow", "immediate"), ("point", "node"), (False, True))
+    product(
+        (2, 3), ("thin plate", "elastic"), ("stick", "follow", "immediate"), ("point", "node"), (False, True)
+    )
 )
 
 
