@@ -8,7 +8,7 @@ import pytest
 
 from cut_cell_reference import QuadraticPlane, needle
 from echospline.errors import InputError
-from echospline.mechanics import Clamps, FEMModel, NeedleForces
+from echospline.mechanics import Clamps, FEMModel, ViscousForces
 from echospline.mechanics.fem_response import FEMResponse
 from echospline.mechanics.finite_elements import factor, stiffness
 from echospline.scene import Insertion, RegularGrid, Tissue
@@ -176,7 +176,7 @@ def test_nodes_and_both_of_their_components_are_the_same_clamp():
 
 
 def test_skin_under_a_sliding_probe_stays_at_the_probe_and_slips_along_it():
-    model = FEMModel(GRID, sliding=["top"], forces=NeedleForces(ramp=0.0))
+    model = FEMModel(GRID, sliding=["top"], forces=ViscousForces(ramp=0.0))
     insertion = Insertion.straight((12.0, 0.0), 60, 20)
     u = model.displacement(model.advance(model.rest(), insertion.pose(insertion.duration), 1.0))
     top = u[GRID.boundary(["top"])]

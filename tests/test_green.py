@@ -76,7 +76,7 @@ def test_stations_kept_between_steps_change_nothing():
 
 def test_tissue_with_regions_agrees_with_finite_elements():
     tissue = Tissue(regions=[Region(Circle((20, 15), 5), 50.0)])
-    forces, pose = NeedleForces(0.4, 0.0, ramp=0.0), NeedlePose((12, 0), (16, 9), 5.0)
+    forces, pose = ViscousForces(0.4, 0.0, ramp=0.0), NeedlePose((12, 0), (16, 9), 5.0)
     grid = RegularGrid((81, 61), (0.5, 0.5))
     u, v = (
         m.advance(m.rest(), pose, 1.0).displacement

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from echospline.errors import InputError
-from echospline.mechanics import Clamps, GreenModel, NeedleForces
+from echospline.mechanics import Clamps, GreenModel, ViscousForces
 from echospline.mechanics.boundary_forces import BoundaryForces, divide
 from echospline.mechanics.green_response import TRUSTED, green_response
 from echospline.mechanics.half_plane import HalfPlane
@@ -389,7 +389,7 @@ def test_limits_are_said_in_a_sentence_and_once_per_model():
     assert set(said) == {"near", "folding"}
     assert "0.5 mm from an edge" in said["near"]
     assert "lower the force" in said["folding"]
-    model = GreenModel(GRID, BOX, Tissue(2.0), NeedleForces(0.4, 0.0, ramp=0.0))
+    model = GreenModel(GRID, BOX, Tissue(2.0), ViscousForces(0.4, 0.0, ramp=0.0))
     insertion, state = Insertion.straight((12, 0), 60, 20), model.rest()
     with warnings.catch_warnings(record=True) as heard:
         warnings.simplefilter("always")

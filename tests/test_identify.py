@@ -119,7 +119,7 @@ def test_least_distances_agree_with_a_general_optimiser(fem_truth):
 def test_friction_is_never_negative(kernel, objective):
     """Above a table alone everything moves along with the needle, and the free minimum asks for friction of the wrong sign."""
     seen = observe(
-        FEMModel(GRID, ("bottom",), forces=NeedleForces(0.4, 1e-4, ramp=0.0)),
+        FEMModel(GRID, ("bottom",), forces=ViscousForces(0.4, 1e-4, ramp=0.0)),
         Insertion.straight((12, 0), 90, 20, 5),
     )
     edges = ("bottom",) if kernel.components == 2 else ("bottom", "left")

@@ -250,7 +250,7 @@ class HalfPlane:
         a, e2 = 3.0 - 4.0 * self.nu, radius * radius
         b = -1.0 if self.top == "free" else a
         n = (normals[:, 0] + 1j * normals[:, 1])[:, None]
-        w: NDArray[np.complex128] = 1.0 / (dx + 1j * (y + c))
+        w: NDArray[np.complex128] = 1.0 / (dx + 1j * (y + c)).astype(np.complex128)
         T = np.empty((len(normals), 2, dx.shape[1], 2))
         for j, F in enumerate((1.0, 1j)):
             G = complex(F).conjugate()

@@ -411,7 +411,7 @@ class Reference:
         elif tip is not None and (moved <= 0 or _lengths(point - tip.point) > max(travel, LET_GO)):
             return self._leaving_tip(tip, new, q, dt, travel)
         place = point + lead * axis
-        clearance = self.clamps.clearance(place, axis)
+        clearance = self.clamps.clearance(place.tolist(), axis)
         if pose.depth < ZERO_LENGTH or clearance <= SAME_PLACE:
             return None if tip is None else self._leaving_tip(tip, new, q, dt, travel)
         clear = _lengths(self.grid.nodes[new.contacts[~new.touching]] - place).min(initial=inf) > self.gap
@@ -532,7 +532,7 @@ def _between(before: Pose, after: Pose, share: float) -> Pose:
         np.add(a, share * np.subtract(b, a))
         for a, b in ((before.entry, after.entry), (before.tip, after.tip))
     )
-    return _at(entry, tip, after.speed)
+    return _at(entry.tolist(), tip.tolist(), after.speed)
 
 
 def _lengths(vectors: Floats) -> Floats:
