@@ -65,9 +65,7 @@ class Pictures:
             raise InputError(f"uploads cannot be stored here ({error.strerror})") from error
         return self.folder / f"receiving-{secrets.token_hex(8)}"
 
-    def keep(
-        self, part: Path, digest: str, suffix: str, spacing: tuple[float, float] | None
-    ) -> Picture:
+    def keep(self, part: Path, digest: str, suffix: str, spacing: tuple[float, float] | None) -> Picture:
         """Give a received file its name, and record its spacing.
 
         Parameters
@@ -116,14 +114,14 @@ class Pictures:
         Parameters
         ----------
         needed : callable
-            Returns whether a session was recorded in the file of this name.
+            Returns whether a session was recorded in the scene of this name.
         now : float, optional
             Seconds since 1970.
         """
         now = time.time() if now is None else now
         with suppress(OSError):
             for picture in self._all():
-                if now - picture.path.stat().st_mtime > KEPT_UNUSED and not needed(picture.path.name):
+                if now - picture.path.stat().st_mtime > KEPT_UNUSED and not needed(picture.name):
                     self.drop(picture.name)
             for part in self.folder.glob("receiving-*"):
                 if now - part.stat().st_mtime > KEPT_UNUSED:

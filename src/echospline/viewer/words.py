@@ -12,7 +12,9 @@ _REMEDIES = (
     ("--region", "cut the picture to its ultrasound part"),
 )
 """What stands for an option in a message that asks for it."""
-_PRIVATE = re.compile(r"--[a-z]|[a-z_]+=|\b[a-z]+(?:\.[a-z_]+)+ =|in Python|\.toml\b|[\\/][\w.~-]+[\\/]|(?:^|\s)~?/\w")
+_PRIVATE = re.compile(
+    r"--[a-z]|[a-z_]+=|\b[a-z]+(?:\.[a-z_]+)+ =|in Python|\.toml\b|[\\/][\w.~-]+[\\/]|(?:^|\s)~?/\w"
+)
 """An option, a keyword argument or key of a scenario, or a path."""
 NOTHING_LEFT = "this file cannot be read as a picture"
 
