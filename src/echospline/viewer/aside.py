@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 T = TypeVar("T")
 
@@ -40,3 +40,29 @@ async def aside(function: Callable[..., T], *arguments: object) -> T:
 
     threading.Thread(target=run, name="echospline-aside", daemon=True).start()
     return await done
+
+
+class Ending:
+    """Whether the server is ending: whoever waits for something long waits for this as well."""
+
+    def __init__(self) -> None:
+        self._begun = asyncio.Event()
+
+    def begin(self) -> None:
+        """End every wait of `first`."""
+        self._begun.set()
+
+    async def first(self, work: asyncio.Future[T], timeout: float | None) -> bool:
+        """Wait until a work is done (true), or the time is up or the server ends (false)."""
+        ending = asyncio.ensure_future(self._begun.wait())
+        both: list[asyncio.Future[Any]] = [work, ending]
+        try:
+            done, _ = await asyncio.wait(both, timeout=timeout, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            ending.cancel()
+        return work in done
+
+    @property
+    def begun(self) -> bool:
+        """Whether it is ending."""
+        return self._begun.is_set()

@@ -94,32 +94,32 @@ class Client:
         self._commands, self._requests = Allowance(400, 400), Allowance(20, 40)
         self._reported, self._intervals = 0.0, deque([FASTEST_DISPLAY], maxlen=16)
         self._failure: str | None = None
+        self._pacer = Pacer(seat.engine)
         self._told: asyncio.Queue[tuple[str, dict[str, object]]] = asyncio.Queue()
         self._loop = asyncio.get_running_loop()
         self._credit.set()
 
     async def serve(self, resumed: bool) -> None:
-        """Serve until the page closes or breaks the protocol; the engine's thread ends with it."""
+        """Serve until the page closes or breaks the protocol; `leave` then ends the engine's thread."""
         await self._send_text("scene", **self._describe(resumed))
-        pacer = Pacer(self.seat.engine)
-        pacer.start()
+        self._pacer.start()
+        tasks = [
+            asyncio.create_task(self._receive()),
+            asyncio.create_task(self._send_frames()),
+            asyncio.create_task(self._send_told()),
+        ]
         try:
-            tasks = [
-                asyncio.create_task(self._receive()),
-                asyncio.create_task(self._send_frames()),
-                asyncio.create_task(self._send_told()),
-            ]
-            try:
-                done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-            finally:
-                for task in tasks:
-                    task.cancel()
-                results = await asyncio.gather(*tasks, return_exceptions=True)
-            for error in results:
-                await self._close(error)
-            del done
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
-            await aside(pacer.stop)  # a step may be building a model: nobody else waits for it
+            for task in tasks:
+                task.cancel()
+            results = await asyncio.gather(*tasks, return_exceptions=True)
+        for error in results:
+            await self._close(error)
+
+    async def leave(self) -> None:
+        """End the engine's thread; it may be building a model, and nobody else waits for that."""
+        await aside(self._pacer.stop)
 
     def tell(self, what: str, **content: object) -> None:
         """Send a message to the page; any thread may call."""

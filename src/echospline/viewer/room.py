@@ -10,13 +10,13 @@ from collections import OrderedDict
 from dataclasses import dataclass, field, replace
 
 from echospline.errors import EchosplineError, InputError
-from echospline.viewer.aside import aside
+from echospline.viewer.aside import Ending, aside
 from echospline.viewer.client import Client, Seat
 from echospline.viewer.guard import checked_origin
 from echospline.viewer.pictures import Picture
 from echospline.viewer.served_scene import Scene, SceneOpener
 from echospline.viewer.sessions import Sessions
-from echospline.viewer.upload import UploadError, UploadLimits, Uploads
+from echospline.viewer.upload import UploadError, UploadLimits, Uploads, ended
 
 log = logging.getLogger(__name__)
 
@@ -102,7 +102,13 @@ class Room:
     parked: OrderedDict[str, tuple[float, Seat]] = field(default_factory=OrderedDict)
     taken: list[Seat] = field(default_factory=list)
     pages: list[Client] = field(default_factory=list)
+    leaving: dict[str, asyncio.Event] = field(default_factory=dict)
     tracker: str = ""
+
+    @property
+    def ending(self) -> Ending:
+        """Whether the server is ending."""
+        return self.uploads.ending
 
     def scene(self, name: str) -> Scene | None:
         """Return a scene in memory; the empty name is the scene that the server was started with."""
@@ -154,12 +160,13 @@ class Room:
 
     async def _read(self, opener: SceneOpener, picture: Picture) -> Scene:
         reading = asyncio.ensure_future(aside(opener, picture.path, picture.spacing))
-        done, _ = await asyncio.wait([reading], timeout=self.settings.uploads.reading)
-        if done:
+        if await self.ending.first(reading, self.settings.uploads.reading):
             return reading.result()
         # A thread cannot be ended: this one goes on, and is counted until it ends by itself.
         self.strays += 1
         reading.add_done_callback(self._back)
+        if self.ending.begun:
+            raise ended()
         raise UploadError(
             422, f"this file could not be read within {self.settings.uploads.reading:g} s: save it as a PNG"
         )
@@ -174,7 +181,7 @@ class Room:
         if not self.sessions.needs(name):
             self.sessions.pictures.drop(name)
 
-    def take_seat(self, key: str, name: str, scene: Scene) -> tuple[Seat, bool]:
+    def take_seat(self, key: str, scene: Scene) -> tuple[Seat, bool]:
         """Return the parked seat of a page that comes back to its scene, or a new one."""
         self._forget()
         _, seat = self.parked.pop(key, (0.0, None))

@@ -139,6 +139,7 @@ def serve(
     InputError
         If the address cannot be bound.
     """
+    room: Room = app.state.room
     listener = _listen(settings)
     port = listener.getsockname()[1]
     name = f"[{settings.host}]" if ":" in settings.host else settings.host
@@ -170,6 +171,8 @@ def serve(
         while not serving.done():
             await asyncio.wait([serving], timeout=0.1)
             server.should_exit = server.should_exit or stop()
+            if server.should_exit:
+                room.ending.begin()
         watching.cancel()
         await serving
 
@@ -315,19 +318,7 @@ async def _live(websocket: WebSocket) -> None:
         return
     room.clients += 1
     try:
-        seat, resumed = await aside(room.take_seat, key, name, scene)
-        page = Client(websocket, seat, room.sessions, nodes=room.settings.nodes)
-        room.taken.append(seat)
-        room.pages.append(page)
-        if room.tracker and scene is room.scene(""):
-            page.tell("tracker", text=room.tracker)
-        try:
-            await page.serve(resumed)
-        finally:
-            room.taken.remove(seat)
-            room.pages.remove(page)
-            if _KEY.fullmatch(key):
-                room.park(key, seat)
+        await _serve_page(websocket, room, scene, key if _KEY.fullmatch(key) else "")
     except WebSocketDisconnect:
         pass
     except EchosplineError as error:
@@ -336,3 +327,34 @@ async def _live(websocket: WebSocket) -> None:
         await websocket.close(1011, reason.encode()[:120].decode("utf-8", "ignore"))
     finally:
         room.clients -= 1
+
+
+async def _serve_page(websocket: WebSocket, room: Room, scene: Scene, key: str) -> None:
+    """Serve an accepted page until it leaves; with a key its seat is kept for a reload."""
+    if key in room.leaving:  # a reload that is quicker than the end of its engine's thread
+        await room.leaving[key].wait()
+    taking = asyncio.ensure_future(aside(room.take_seat, key, scene))
+    if not await room.ending.first(taking, None):  # building a model may take longer than the end may
+        return
+    seat, resumed = taking.result()
+    page = Client(websocket, seat, room.sessions, nodes=room.settings.nodes)
+    room.taken.append(seat)
+    room.pages.append(page)
+    if room.tracker and scene is room.scene(""):
+        page.tell("tracker", text=room.tracker)
+    try:
+        await page.serve(resumed)
+    finally:
+        left = asyncio.Event()
+        if key:
+            room.leaving[key] = left
+        try:
+            await page.leave()
+        finally:
+            room.taken.remove(seat)
+            room.pages.remove(page)
+            if key:
+                room.park(key, seat)
+            left.set()
+            if room.leaving.get(key) is left:
+                del room.leaving[key]

@@ -12,6 +12,7 @@ from pathlib import Path
 from starlette.requests import ClientDisconnect, Request
 
 from echospline.errors import EchosplineError
+from echospline.viewer.aside import Ending
 
 
 class UploadError(EchosplineError):
@@ -66,6 +67,7 @@ class Uploads:
 
     def __init__(self, limits: UploadLimits) -> None:
         self.limits = limits
+        self.ending = Ending()
         self._busy: set[str] = set()
 
     @contextmanager
@@ -104,17 +106,21 @@ class Uploads:
         chunks = aiter(request.stream())
         with path.open("wb") as file:
             while True:
-                left = start + limits.deadline - clock()
-                try:
-                    chunk = await asyncio.wait_for(anext(chunks), max(0.0, min(limits.stall, left)))
-                except StopAsyncIteration:
-                    return digest.hexdigest()
-                except TimeoutError:
+                left = max(0.0, start + limits.deadline - clock())
+                coming = asyncio.ensure_future(anext(chunks, b""))
+                if not await self.ending.first(coming, min(limits.stall, left)):
+                    coming.cancel()
+                    if self.ending.begun:
+                        raise ended()
                     raise UploadError(
                         408, f"the file came too slowly: {size} bytes in {clock() - start:.0f} s; try again"
-                    ) from None
+                    )
+                try:
+                    chunk = coming.result()
                 except ClientDisconnect:
                     raise UploadError(400, "the connection ended before the file did") from None
+                if not chunk:  # the stream ends with an empty piece
+                    return digest.hexdigest()
                 size += len(chunk)
                 if size > limits.size:
                     raise too_large
@@ -127,3 +133,8 @@ class Uploads:
                     )
                 digest.update(chunk)
                 file.write(chunk)
+
+
+def ended() -> UploadError:
+    """Return the refusal of an upload that the end of the server cuts short."""
+    return UploadError(503, "the server is ending")

@@ -13,9 +13,9 @@ _REMEDIES = (
 )
 """What stands for an option in a message that asks for it."""
 _PRIVATE = re.compile(
-    r"--[a-z]|[a-z_]+=|\b[a-z]+(?:\.[a-z_]+)+ =|in Python|\.toml\b|[\\/][\w.~-]+[\\/]|(?:^|\s)~?/\w"
+    r"--[a-z]|[a-z_]+=|\b[a-z]+(?:\.[a-z_]+)+ =|in Python|raise the limit|\.toml\b|[\\/][\w.~-]+[\\/]|(?:^|\s)~?/\w"
 )
-"""An option, a keyword argument or key of a scenario, or a path."""
+"""An option, a keyword argument or key of a scenario, a limit of the command line, or a path."""
 NOTHING_LEFT = "this file cannot be read as a picture"
 
 
