@@ -6,7 +6,6 @@ import hmac
 import logging
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
@@ -134,13 +133,13 @@ def checked_origin(text: str) -> str:
     InputError
         If it is not ``http://HOST``, ``https://HOST`` or one of them with a port.
     """
-    parts = None
-    with suppress(ValueError):
+    try:
         parts = urlsplit(text.strip().lower())
-        _ = parts.port
+        number = parts.port
+    except ValueError:
+        parts, number = urlsplit(""), None
     if (
-        parts is None
-        or parts.scheme not in DEFAULT_PORTS
+        parts.scheme not in DEFAULT_PORTS
         or not parts.hostname
         or parts.username is not None
         or parts.path not in ("", "/")
@@ -151,7 +150,7 @@ def checked_origin(text: str) -> str:
             f"an origin is https://HOST or https://HOST:PORT, without a path; got {text[:100]!r}"
         )
     host = f"[{parts.hostname}]" if ":" in parts.hostname else parts.hostname
-    port = "" if parts.port in (None, DEFAULT_PORTS[parts.scheme]) else f":{parts.port}"
+    port = "" if number in (None, DEFAULT_PORTS[parts.scheme]) else f":{number}"
     return f"{parts.scheme}://{host}{port}"
 
 
