@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from typer.testing import CliRunner
 
 from echospline.cli.app import app
@@ -19,13 +20,14 @@ from echospline.cli.live import opener_for, scene_of
 from echospline.cli.options import scenario_from
 from echospline.cli.sessions import keyframes
 from echospline.errors import InputError
-from echospline.io import read_displacement
+from echospline.io import read_displacement, read_image
 from echospline.live import Trace
 from echospline.scenario import MODELS
 from echospline.scene import Insertion
 from echospline.viewer import Sessions, score
 from echospline.viewer.protocol import SPLINE
-from test_viewer_server import page
+from live_scene import running
+from test_viewer_server import get, page
 
 PERIOD = 1 / 120
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
@@ -108,8 +110,6 @@ def test_a_needle_outside_the_image_is_refused():
 def test_an_uploaded_picture_becomes_a_scene(tmp_path):
     _, scenario = small_scene()
     picture = tmp_path / "a.png"
-    from PIL import Image  # noqa: PLC0415
-
     Image.fromarray(np.full((50, 80), 90, np.uint8)).save(picture)
     opened = opener_for(scenario)(picture, (0.5, 0.5))
     assert opened.grid.extent == pytest.approx((0.0, 39.5, 0.0, 24.5))
@@ -142,6 +142,36 @@ def test_a_session_becomes_a_cine_with_its_true_motion(kept, tmp_path):
         exact = np.interp(record.times + trace.times[0], trace.times, trace.tip[:, axis])
         np.testing.assert_allclose(record.tip[:, axis], exact, atol=1e-6)
     assert np.abs(record.displacement[-1]).max() > 0.1
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_a_session_in_an_uploaded_picture_becomes_a_cine_when_the_server_is_gone(tmp_path, moved):
+    """Also after its file and the folder beside it were moved."""
+    picture = tmp_path / "mine.png"
+    pixels = np.random.default_rng(1).integers(0, 200, (120, 160), dtype=np.uint8)
+    Image.fromarray(pixels).save(picture)
+    _, scenario = small_scene(**{"output.formats": "mha", "output.figure": False, "output.fps": "20"})
+    path = tmp_path / "served" / "sessions.sqlite"
+    with running(tmp_path / "served", opener=opener_for(scenario)) as (address, _, _):
+        status, _, said = get(address, "/api/upload?name=mine.png&spacing=0.25", "POST", picture.read_bytes())
+        assert status == 200
+        with page(address, f"?scene={json.loads(said)['scene']}") as client:
+            name = client.hello["scene"]["exercises"][0]["name"]
+            client.ask(do="start", exercise=name, trainee="Di")
+            client.hear("running")
+            client.push(5.0, entry=tuple(client.hello["pose"]["entry"]))
+            client.ask(do="finish", keep=True)
+            number = client.hear("summary")["session"]
+    picture.unlink()
+    if moved:
+        path = (tmp_path / "served").rename(tmp_path / "elsewhere") / path.name
+    both = json.loads(invoke("sessions", "rescore", number, "--sessions", path).output)
+    assert both["stored"] == both["now"]
+    invoke("sessions", "cine", number, "--out", tmp_path / "out", "--sessions", path)
+    first = read_image(tmp_path / "out" / "cine.mha")
+    assert first.grid.shape == (160, 120)
+    assert first.grid.spacing == pytest.approx((0.25, 0.25))
+    assert np.abs(read_displacement(tmp_path / "out" / "displacement.npz").displacement[-1]).max() > 0.05
 
 
 def test_keyframes_keep_the_path(kept):
