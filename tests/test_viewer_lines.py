@@ -233,6 +233,25 @@ def test_an_answer_that_nobody_reads_is_given_up(impatient, tmp_path):
         line.close()
 
 
+def test_an_answer_that_is_read_slowly_comes_whole(impatient, tmp_path):
+    grid = IMAGE_GRID.covering(IMAGE_GRID, (4000, 4000))
+    large = UltrasoundImage(np.zeros((4000, 4000), np.uint8), grid)
+    with running(tmp_path, image=large) as (address, _, _):
+        where = urlsplit(address)
+        line = socket.socket()
+        line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
+        line.connect((where.hostname, where.port))
+        line.settimeout(20)
+        line.sendall(b"GET /api/image HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: close\r\n\r\n")
+        size, until = 0, time.monotonic() + 3.0  # three times what an idle connection has
+        while piece := line.recv(1 << 20):
+            size += len(piece)
+            if time.monotonic() < until:
+                time.sleep(0.05)
+        assert size > 16_000_000
+        line.close()
+
+
 def test_a_connection_that_is_used_again_and_again_stays_open(impatient, tmp_path):
     import http.client  # noqa: PLC0415
 
@@ -433,6 +452,19 @@ def test_a_picture_stays_as_long_as_its_sessions(tmp_path):
     assert sessions.pictures.find(used) is not None
     assert len(list(folder.iterdir())) == 2  # the picture and its record
     assert Pictures(folder).find("../../../etc/pas") is None
+
+
+def test_a_scene_that_was_dropped_from_memory_is_opened_again_if_it_has_sessions(tmp_path, monkeypatch):
+    monkeypatch.setattr("echospline.viewer.room.UPLOADED_SCENES", 1)
+    with running(tmp_path, opener=picture_scene) as (address, sessions, app):
+        used = json.loads(upload(address, png(tmp_path, 90))[2])["scene"]
+        with page(address, f"?scene={used}") as client:
+            train(client)
+        unused, last = (json.loads(upload(address, png(tmp_path, shade))[2])["scene"] for shade in (91, 92))
+        assert sorted(app.state.room.scenes) == ["", last]
+        assert sessions.pictures.find(unused) is None
+        assert get(address, f"/api/image?scene={unused}")[0] == 404
+        assert get(address, f"/api/image?scene={used}")[2][:100] == bytes([90] * 100)
 
 
 def test_the_same_file_in_two_sizes_is_two_scenes_of_one_file(tmp_path):

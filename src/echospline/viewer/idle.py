@@ -41,7 +41,8 @@ class Watch:
             connection, "cycle", self
         )  # a web socket has none: its pings find out whether it lives
         served = cycle is not None and not getattr(cycle, "response_complete", False)
-        if served or cycle is not self._cycle:
+        # An answer may be complete for uvicorn while most of it waits to be taken.
+        if served or waiting or cycle is not self._cycle:
             self._cycle, self._since = cycle, now
         return now - self._since > HEADERS or now - self._moved > STALL
 
