@@ -6,6 +6,7 @@ import csv
 import json
 import re
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -22,8 +23,10 @@ from echospline.cli.sessions import keyframes
 from echospline.errors import InputError
 from echospline.io import read_displacement, read_image
 from echospline.live import Trace
+from echospline.openigtlink import Message, Transform
+from echospline.openigtlink.message import encode
 from echospline.scenario import MODELS
-from echospline.scene import Insertion
+from echospline.scene import AXIAL, ImagingPlane, Insertion, NeedlePose
 from echospline.viewer import Sessions, score
 from echospline.viewer.protocol import SPLINE
 from live_scene import running
@@ -88,6 +91,35 @@ def test_live_serves_the_page_and_the_real_model_and_ends_when_told(tmp_path):
             assert process.wait(60) == 0
         assert "Traceback" not in process.stderr.read()
     assert (tmp_path / "deep" / "kept.sqlite").exists()
+
+
+def test_a_tracker_that_is_lost_is_said_on_the_page_of_live_with_its_link(tmp_path):
+    command = [sys.executable, "-m", "echospline", "live", "--no-browser", "--port", "0", "--mesh", "12x9", "--link",
+               "--link-port", "0", "--link-silence", "1.5", "--sessions", str(tmp_path / "kept.sqlite")]  # fmt: skip
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            said = ""
+            while "sessions are kept" not in said:
+                said += process.stderr.readline()
+            address = re.search(r"http://\S+", said).group().rstrip("/")
+            port = int(re.search(r"OpenIGTLink on 127\.0\.0\.1:(\d+)", said).group(1))
+            tip = ImagingPlane(AXIAL).tip_matrix(NeedlePose((20.0, 0.0), (20.0, 8.0)))
+            with page(address) as client, socket.create_connection(("127.0.0.1", port)) as tracker:
+                tracker.sendall(encode(Message(Transform(tip), "NeedleTipToReference")))
+                client.until(lambda f: f.tip[1] > 7.0, timeout=30)
+                bad = Message(
+                    Transform(np.eye(4)), "NeedleTipToReference", 0.0, 2, {"TransformStatus": "MISSING"}
+                )
+                tracker.sendall(encode(bad))
+                assert "NeedleTipToReference is MISSING" in client.hear("tracker")["text"]
+                assert client.until(lambda f: True).tip[1] > 7.0
+                tracker.sendall(encode(Message(Transform(tip), "NeedleTipToReference")))
+                assert client.hear("tracker")["text"] == ""
+                assert "silent for 1.5 s" in client.hear("tracker")["text"]
+        finally:
+            process.send_signal(signal.SIGINT)
+            assert process.wait(60) == 0
+        assert "Traceback" not in process.stderr.read()
 
 
 def test_every_model_can_be_steered_in_a_scene():
