@@ -124,6 +124,17 @@ def link(
         Path | None,
         typer.Option(metavar="FOLDER", help="scenarios that peers may load by name; without, none"),
     ] = None,
+    silence: Annotated[
+        float,
+        typer.Option(metavar="S", help="seconds without a transform after which the needle counts as stale"),
+    ] = 0.5,
+    ask: Annotated[
+        str,
+        typer.Option(
+            metavar="TYPE",
+            help="stream that servers of --connect are asked to start: TDATA, QTDATA, QTRANS, POSITION or none",
+        ),
+    ] = "TDATA",
     duration: Annotated[
         float, typer.Option(metavar="S", min=0, help="end after so many seconds; 0 runs until Ctrl+C")
     ] = 0.0,
@@ -152,6 +163,8 @@ def link(
         looks=Looks(naming, embed, scenario.needle_echo()),
         reach=Reach(thickness=beam, contact=contact),
         rates=Rates(scenario.output.fps, mesh_rate),
+        silence=silence,
+        ask="" if ask.lower() == "none" else ask.upper(),
     )
     if not options.host and not options.connect:
         raise InputError("nothing to do: with --no-serve give --connect HOST:PORT")

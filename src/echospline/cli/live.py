@@ -17,12 +17,24 @@ from threadpoolctl import threadpool_limits
 from echospline.cli.link import address, make_stage
 from echospline.cli.options import scenario_from, with_scenario_options
 from echospline.errors import InputError
+from echospline.io import open_recording
 from echospline.openigtlink import PORT, Looks, Naming, Rates, Session, SessionOptions, read_calibration
 from echospline.picture import NeedleEcho
 from echospline.scenario import MODELS, Scenario, build_model
 from echospline.scene import UltrasoundImage
-from echospline.viewer import Scene, Sessions, Settings, build_app, default_exercises, serve, steer
+from echospline.viewer import (
+    Scene,
+    Sessions,
+    Settings,
+    announce,
+    build_app,
+    default_exercises,
+    serve,
+    steer,
+)
 
+LARGEST_UPLOAD = 256.0
+"""MiB of one decoded frame; 4096 x 4096 pixels, the most that a page shows, have 128 in double precision."""
 LABELS = {"tps": "TPS", "elastic": "Elastic", "green": "Green", "fem": "FEM"}
 
 
@@ -78,6 +90,24 @@ def live(
     link_config: Annotated[
         Path | None, typer.Option(metavar="FILE.xml", help="PLUS device set file with the calibration")
     ] = None,
+    link_silence: Annotated[
+        float,
+        typer.Option(metavar="S", help="seconds without a transform after which the tracker counts as stale"),
+    ] = 0.5,
+    origin: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="https://HOST",
+            help="address of a reverse proxy in front, as browsers see it; may be repeated; asks pages for a token",
+        ),
+    ] = None,
+    token: Annotated[
+        bool,
+        typer.Option(
+            "--token/--no-token",
+            help="ask pages for a token where others can reach them; without, the proxy must",
+        ),
+    ] = True,
     changes: dict[str, Any] | None = None,
 ) -> None:
     """Steer the needle in the browser and see the tissue move.
@@ -88,7 +118,9 @@ def live(
     scenario, folder = scenario_from(source, changes or {})
     image = scenario.read_image(folder)
     scene = scene_of(scenario, image, folder)
-    settings = Settings(host, port, rate, clients, nodes=nodes)
+    settings = Settings(
+        host, port, rate, clients, nodes=nodes, origins=tuple(origin or ()), open_door=not token
+    )
     kept = Sessions(sessions or default_sessions())
     scene.models(scene.names[0][0])  # refuses an invalid scenario before a page waits for it
     app = build_app(scene, kept, settings, opener_for(scenario))
@@ -116,8 +148,10 @@ def live(
                         echo=scenario.needle_echo(),
                     ),
                     rates=Rates(scenario.output.fps),
+                    silence=link_silence,
                 ),
                 moved=lambda pose, appears: steer(app, pose, appears),
+                tracked=lambda text: announce(app, text),
             )
             stack.enter_context(session)
             console.print(f"OpenIGTLink on 127.0.0.1:{session.port}", highlight=False)
@@ -171,6 +205,7 @@ def opener_for(scenario: Scenario) -> Callable[[Path, tuple[float, float] | None
         values: dict[str, Any] = {"title": "Your image", "image.file": str(path), "image.spacing": spacing, "image.frame": 0,
                   "image.region": None, "tissue.region": [], "mesh.clamped_points": [], "exercise": []}  # fmt: skip
         bare = scenario.with_values(values, "upload")
+        open_recording(path, LARGEST_UPLOAD, whole=False)  # refuses a bomb by its header
         image = bare.read_image(path.parent)
         x0, x1, y0, _ = bare.grid(image).extent
         return scene_of(bare.with_values({"needle.entry": (x0 + 0.2 * (x1 - x0), y0)}), image, path.parent)

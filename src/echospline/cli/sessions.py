@@ -94,7 +94,8 @@ def cine(
     kept: Kept = None,
 ) -> None:
     """Run a stored session's needle again: the cine with its true motion, as `echospline simulate` writes it."""
-    session, _, trace = _open(kept).load(number)
+    stored = _open(kept)
+    session, _, trace = stored.load(number)
     if not session.source:
         raise InputError(
             f"session {number} does not say what its scene was made from, so it cannot be run again"
@@ -103,6 +104,11 @@ def cine(
         {"needle.path": keyframes(trace), "model.kind": session.model}, f"session {number}"
     )
     folder = Path.cwd()
+    beside = stored.pictures.folder / Path(scenario.image.file).name
+    if (
+        session.upload and beside.is_file()
+    ):  # the sessions may have been moved, with their pictures beside them
+        scenario = scenario.with_values({"image.file": str(beside.resolve())}, f"session {number}")
     image = scenario.read_image(folder)
     report = run(scenario, image, build_model(scenario, scenario.grid(image), folder=folder), out, folder)
     print(f"results in {out}: {', '.join(report['files'])}")

@@ -8,7 +8,7 @@ from echospline.scene.metrics import MOVED, FieldError, distance, field_error
 from echospline.scene.needle import ZERO_LENGTH, Insertion, NeedlePose
 from echospline.scene.tissue import Circle, Label, Layer, Polygon, Region, Shape, Tissue
 from echospline.scene.transducer import FWHM, TRANSDUCERS, Transducer
-from echospline.scene.transform import as_transform, frames_of, transform_between
+from echospline.scene.transform import as_transform, chain_between, frames_of, transform_between
 
 __all__ = [
     "AXIAL",
@@ -43,6 +43,7 @@ __all__ = [
     "Visible",
     "as_points",
     "as_transform",
+    "chain_between",
     "distance",
     "field_error",
     "fourier_frequencies",
