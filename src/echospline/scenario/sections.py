@@ -44,7 +44,7 @@ Point = tuple[Millimetres, Millimetres]
 class Section(BaseModel):
     """A table of the file: unknown keys are refused, infinite and NaN numbers too."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
 
 
 class ImageSection(Section):
@@ -243,10 +243,10 @@ class ModelSection(Section):
     """The tissue model."""
 
     kind: Literal["tps", "elastic", "green", "fem"] = Field("tps", description="tps, elastic, green or fem")
-    landmarks: LandmarkSection = LandmarkSection()
-    elastic: ElasticSection = ElasticSection()
-    green: GreenSection = GreenSection()
-    forces: ForceSection = ForceSection()
+    landmarks: LandmarkSection = Field(default_factory=LandmarkSection)
+    elastic: ElasticSection = Field(default_factory=ElasticSection)
+    green: GreenSection = Field(default_factory=GreenSection)
+    forces: ForceSection = Field(default_factory=ForceSection)
 
 
 class OutputSection(Section):
