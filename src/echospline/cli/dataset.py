@@ -13,9 +13,9 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from echospline import scenario as scenario_room
+from echospline import study as study_room
 from echospline.errors import InputError
-from echospline.scenario import load
-from echospline.study import Task, create_store, make_sample, sweep, write_summary
 
 
 def dataset(
@@ -44,16 +44,18 @@ def dataset(
     """
     with as_file(files("echospline").joinpath("data", "dataset.toml")) as own:
         bases = [str(path.resolve()) for path in scenarios or [own]]
-        shapes = {(s.phantom.grid().shape, s.mesh.nodes) for s in map(load, map(Path, bases))}
+        shapes = {(s.phantom.grid().shape, s.mesh.nodes) for s in map(scenario_room.load, map(Path, bases))}
         if len(shapes) > 1:
             raise InputError(
                 "all bases of a dataset need the same phantom.size, phantom.pixel and mesh.nodes"
             )
         began = perf_counter()
         # names, not paths: the dataset is the same wherever it is made
-        create_store(out, load(Path(bases[0])), n, frames, seed, [Path(b).name for b in bases])
+        study_room.create_store(
+            out, scenario_room.load(Path(bases[0])), n, frames, seed, [Path(b).name for b in bases]
+        )
         tasks = [
-            Task(
+            study_room.Task(
                 f"{i:07d}",
                 {"store": str(out.resolve()), "bases": bases, "index": i, "seed": seed, "frames": frames},
             )
@@ -64,8 +66,8 @@ def dataset(
             console=Console(stderr=True), transient=True, disable=json_,
         ) as bar:  # fmt: skip
             line = bar.add_task("samples", total=n)
-            outcome = sweep(
-                make_sample, tasks, out / "tasks", workers=workers, scheduler=scheduler,
+            outcome = study_room.sweep(
+                study_room.make_sample, tasks, out / "tasks", workers=workers, scheduler=scheduler,
                 report=lambda name: bar.advance(line),
             )  # fmt: skip
         seconds = perf_counter() - began
@@ -79,7 +81,7 @@ def dataset(
         "samples_per_second": made / seconds,
         "largest_mm": max((r["largest_mm"] for r in outcome.results.values()), default=0.0),
     }
-    write_summary(out, report)
+    study_room.write_summary(out, report)
     if json_:
         json.dump(report, sys.stdout, indent=1)
         print()

@@ -11,8 +11,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from echospline import study as study_room
 from echospline.errors import InputError
-from echospline.study import Task, calibrate, sweep
 
 
 def identify(
@@ -79,12 +79,14 @@ def identify(
             "needle": None if needle is None else str(needle.resolve()), "confidence": confidence,
             "method": method, "frames": frames, "runs": runs, "bootstrap": bootstrap, "seed": seed,
         }  # fmt: skip
-        tasks.append(Task(name, arguments))
+        tasks.append(study_room.Task(name, arguments))
     if len(tasks) == 1 and not workers and scheduler is None:
-        reports = {names[0]: calibrate(**tasks[0].arguments)}
+        reports = {names[0]: study_room.calibrate(**tasks[0].arguments)}
         failed: dict[str, str] = {}
     else:
-        outcome = sweep(calibrate, tasks, out / "tasks", workers=workers, scheduler=scheduler)
+        outcome = study_room.sweep(
+            study_room.calibrate, tasks, out / "tasks", workers=workers, scheduler=scheduler
+        )
         reports, failed = outcome.results, outcome.failed
     if json_:
         json.dump({"reports": reports, "failed": failed}, sys.stdout, indent=1)

@@ -13,6 +13,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from echospline import scenario as scenario_room
 from echospline.errors import InputError
 from echospline.io import (
     LIMIT,
@@ -26,7 +27,6 @@ from echospline.io import (
     read_displacement,
     sample_image,
 )
-from echospline.scenario import LARGEST_FILE, Scenario, load
 
 
 def info(
@@ -176,17 +176,19 @@ def _of_displacement(path: Path, limit: float) -> dict[str, Any]:
 
 def _of_toml(path: Path) -> dict[str, Any]:
     """Describe a scenario; of another TOML file, list its tables."""
-    if path.stat().st_size > LARGEST_FILE:
-        raise InputError(f"{path} has {path.stat().st_size:,} bytes; a scenario has {LARGEST_FILE:,} at most")
+    if path.stat().st_size > scenario_room.LARGEST_FILE:
+        raise InputError(
+            f"{path} has {path.stat().st_size:,} bytes; a scenario has {scenario_room.LARGEST_FILE:,} at most"
+        )
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path} is no valid TOML: {' '.join(str(error).split())}") from error
-    if not set(document) & set(Scenario.model_fields):
+    if not set(document) & set(scenario_room.Scenario.model_fields):
         return {"format": "TOML, no scenario", "tables": _tables(document), "notes": []}
     about: dict[str, Any] = {"format": "TOML scenario", "tables": _tables(document), "notes": []}
     try:
-        run = load(path)
+        run = scenario_room.load(path)
     except InputError as error:
         about["notes"].append(f"cannot be run: {error}")
     else:

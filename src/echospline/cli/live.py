@@ -14,14 +14,13 @@ import typer
 from rich.console import Console
 from threadpoolctl import threadpool_limits
 
+from echospline import openigtlink, viewer
+from echospline import scenario as scenario_room
 from echospline.cli.link import address, make_stage
 from echospline.cli.options import scenario_from, with_scenario_options
 from echospline.errors import InputError
-from echospline.openigtlink import PORT, Looks, Naming, Rates, Session, SessionOptions, read_calibration
 from echospline.picture import NeedleEcho
-from echospline.scenario import MODELS, Scenario, build_model
 from echospline.scene import UltrasoundImage
-from echospline.viewer import Scene, Sessions, Settings, build_app, default_exercises, serve, steer
 
 LABELS = {"tps": "TPS", "elastic": "Elastic", "green": "Green", "fem": "FEM"}
 
@@ -70,7 +69,7 @@ def live(
     ] = False,
     link_port: Annotated[
         int, typer.Option(min=0, max=65535, help="port for it on this machine; 0 takes any free one")
-    ] = PORT,
+    ] = openigtlink.PORT,
     link_connect: Annotated[
         list[str] | None,
         typer.Option(metavar="HOST:PORT", help="an OpenIGTLink server to connect to; may be repeated"),
@@ -88,10 +87,10 @@ def live(
     scenario, folder = scenario_from(source, changes or {})
     image = scenario.read_image(folder)
     scene = scene_of(scenario, image, folder)
-    settings = Settings(host, port, rate, clients, nodes=nodes)
-    kept = Sessions(sessions or default_sessions())
+    settings = viewer.Settings(host, port, rate, clients, nodes=nodes)
+    kept = viewer.Sessions(sessions or default_sessions())
     scene.models(scene.names[0][0])  # refuses an invalid scenario before a page waits for it
-    app = build_app(scene, kept, settings, opener_for(scenario))
+    app = viewer.build_app(scene, kept, settings, opener_for(scenario))
     console = Console(stderr=True)
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
 
@@ -106,25 +105,27 @@ def live(
             threadpool_limits(limits=1)
         )  # an engine's step is short: more threads make it slower and less punctual
         if link or link_connect:
-            session = Session(
+            session = openigtlink.Session(
                 make_stage(scenario, folder, rate=rate),
-                SessionOptions(
+                openigtlink.SessionOptions(
                     port=link_port,
                     connect=tuple(address(text) for text in link_connect or ()),
-                    looks=Looks(
-                        Naming(calibration=read_calibration(link_config) if link_config else {}),
+                    looks=openigtlink.Looks(
+                        openigtlink.Naming(
+                            calibration=openigtlink.read_calibration(link_config) if link_config else {}
+                        ),
                         echo=scenario.needle_echo(),
                     ),
-                    rates=Rates(scenario.output.fps),
+                    rates=openigtlink.Rates(scenario.output.fps),
                 ),
-                moved=lambda pose, appears: steer(app, pose, appears),
+                moved=lambda pose, appears: viewer.steer(app, pose, appears),
             )
             stack.enter_context(session)
             console.print(f"OpenIGTLink on 127.0.0.1:{session.port}", highlight=False)
-        serve(app, settings, ready)
+        viewer.serve(app, settings, ready)
 
 
-def scene_of(scenario: Scenario, image: UltrasoundImage, folder: Path) -> Scene:
+def scene_of(scenario: scenario_room.Scenario, image: UltrasoundImage, folder: Path) -> viewer.Scene:
     """Build the scene of a scenario: its image, mesh and needle, every model, its exercises or the default three.
 
     Raises
@@ -144,30 +145,34 @@ def scene_of(scenario: Scenario, image: UltrasoundImage, folder: Path) -> Scene:
     kept = scenario.model_copy(
         update={"image": scenario.image.model_copy(update={"file": _whole(scenario, folder)})}
     )
-    return Scene(
+    return viewer.Scene(
         title=scenario.title or scenario.image.file.replace("sample:", "Sample: ").rsplit("/", 1)[-1],
         image=image,
         grid=grid,
-        models=lambda kind: build_model(scenario, grid, kind=kind, folder=folder),
-        names=tuple((kind, LABELS[kind]) for kind in sorted(MODELS, key=lambda kind: kind != first)),
+        models=lambda kind: scenario_room.build_model(scenario, grid, kind=kind, folder=folder),
+        names=tuple(
+            (kind, LABELS[kind]) for kind in sorted(scenario_room.MODELS, key=lambda kind: kind != first)
+        ),
         entry=entry,
         angle=angle,
         echo=scenario.needle_echo() or NeedleEcho(shaft=False, tip=False, tail=False, shadow=False),
-        exercises=tuple(scenario.exercise) or default_exercises(grid),
+        exercises=tuple(scenario.exercise) or viewer.default_exercises(grid),
         source=kept.model_dump_json(),
     )
 
 
-def _whole(scenario: Scenario, folder: Path) -> str:
+def _whole(scenario: scenario_room.Scenario, folder: Path) -> str:
     """Return the name of the image that is valid in every folder."""
     file = scenario.image.file
     return file if file.startswith("sample:") else str((folder / file).resolve())
 
 
-def opener_for(scenario: Scenario) -> Callable[[Path, tuple[float, float] | None], Scene]:
+def opener_for(
+    scenario: scenario_room.Scenario,
+) -> Callable[[Path, tuple[float, float] | None], viewer.Scene]:
     """Build a function that turns uploaded images into scenes with the tissue, mesh and model of a scenario."""
 
-    def opened(path: Path, spacing: tuple[float, float] | None) -> Scene:
+    def opened(path: Path, spacing: tuple[float, float] | None) -> viewer.Scene:
         values: dict[str, Any] = {"title": "Your image", "image.file": str(path), "image.spacing": spacing, "image.frame": 0,
                   "image.region": None, "tissue.region": [], "mesh.clamped_points": [], "exercise": []}  # fmt: skip
         bare = scenario.with_values(values, "upload")

@@ -13,13 +13,12 @@ import typer
 from rich.console import Console
 from rich.progress import track as counted
 
+from echospline import laboratory
+from echospline import scenario as scenario_room
 from echospline.cli.options import scenario_from, with_scenario_options
 from echospline.errors import InputError
 from echospline.io import EchoWriter, open_writer
-from echospline.laboratory import Phantom, phantom_pictures, speckle_statistics
 from echospline.picture import frame_count
-from echospline.scenario import PHANTOM, Scenario, build_model
-from echospline.scenario.run import run
 from echospline.scene import Echo, UltrasoundImage
 
 
@@ -61,17 +60,25 @@ def phantom(
 
 
 def phantom_into(
-    scenario: Scenario, out: Path, folder: Path, *, echoes: bool, rf: bool = False, quiet: bool = True
+    scenario: scenario_room.Scenario,
+    out: Path,
+    folder: Path,
+    *,
+    echoes: bool,
+    rf: bool = False,
+    quiet: bool = True,
 ) -> dict[str, Any]:
     """Run a scenario on its phantom; returns the report of `run` with a table ``phantom``."""
     # the resolved scenario names its own picture, so that simulate and identify use the same mesh
-    scenario = scenario.with_values({"image.file": PHANTOM, "image.region": None, "image.spacing": None})
+    scenario = scenario.with_values(
+        {"image.file": scenario_room.PHANTOM, "image.region": None, "image.spacing": None}
+    )
     section, probe = scenario.phantom, scenario.probe.probe()
     scattered = section.phantom(probe)
     display = section.display()
     still = scattered.form(noise_seed=scattered.seed)
     image = UltrasoundImage(still.b_mode(display, scattered.grid).pixels, scattered.grid, "speckle phantom")
-    model = build_model(scenario, scenario.grid(image), folder=folder)
+    model = scenario_room.build_model(scenario, scenario.grid(image), folder=folder)
     count = frame_count(scenario.insertion(), scenario.output.fps)
     fps = scenario.output.fps
     with ExitStack() as stack:
@@ -95,18 +102,18 @@ def phantom_into(
             if lines is not None:
                 lines.add(echo.rf(probe.sampling, probe.sound_speed)[0].astype(np.float32), index / fps)
 
-        former = phantom_pictures(
+        former = laboratory.phantom_pictures(
             scattered, display=display, fps=fps, out_of_plane=section.out_of_plane, record=record
         )
-        report = run(scenario, image, model, out, folder, form_image=former)
+        report = scenario_room.run(scenario, image, model, out, folder, form_image=former)
     report["phantom"] = described(scattered, still)
     report["files"] += [name for name, made in (("echoes.npz", echoes), ("rf.mha", rf)) if made]
     return report
 
 
-def described(phantom: Phantom, still: Echo) -> dict[str, Any]:
+def described(phantom: laboratory.Phantom, still: Echo) -> dict[str, Any]:
     """Describe the phantom, and the statistics of its speckle at rest."""
-    found = speckle_statistics(still.envelope(), still.grid.spacing)
+    found = laboratory.speckle_statistics(still.envelope(), still.grid.spacing)
     return {
         "scatterers": len(phantom.scatterers.amplitudes),
         "carrier_per_mm": phantom.probe.carrier,

@@ -13,14 +13,13 @@ import numpy as np
 import typer
 from threadpoolctl import threadpool_limits
 
+from echospline import openigtlink
+from echospline import scenario as scenario_room
 from echospline.atomic import part_of, writing
 from echospline.cli.link import axis_of
 from echospline.cli.options import scenario_from, with_scenario_options
 from echospline.errors import InputError
-from echospline.io.sequence import SequenceWriter, read_sequence
-from echospline.openigtlink import read_calibration
 from echospline.picture import simulate
-from echospline.scenario import build_model
 from echospline.scene import Pixels
 
 
@@ -56,6 +55,9 @@ def recorded(
     options. Writes `resimulated.igs.mha` and `comparison.csv`: for each frame the correlation of the recorded picture with
     the simulated one, and with the first frame (the result without a simulation).
     """
+    # SimpleITK is slow to load
+    from echospline.io.sequence import SequenceWriter, read_sequence  # noqa: PLC0415
+
     scenario, folder = scenario_from(str(file), changes or {})
     sequence = read_sequence(file)
     spacing = scenario.image.spacing
@@ -64,9 +66,9 @@ def recorded(
         needle_frame,
         spacing=spacing,
         axis=axis_of(needle_axis),
-        calibration=read_calibration(config) if config else None,
+        calibration=openigtlink.read_calibration(config) if config else None,
     )
-    model = build_model(scenario, scenario.grid(image), folder=folder)
+    model = scenario_room.build_model(scenario, scenario.grid(image), folder=folder)
     span = float(insertion.times[-1] - insertion.times[0])
     fps = max(1.0, (len(insertion.times) - 1) / span)
     rows: list[dict[str, float]] = []

@@ -11,15 +11,15 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from echospline import live as live_room
+from echospline import scenario as scenario_room
+from echospline import viewer
 from echospline.cli.live import default_sessions
+from echospline.cli.options import LOOKS
 from echospline.errors import InputError
-from echospline.live import Trace
-from echospline.scenario import build_model, validated
-from echospline.scenario.run import run
-from echospline.viewer import Sessions, score, sessions_csv, trace_csv
 
 sessions = typer.Typer(
-    no_args_is_help=True, help="Training sessions: list, export, score again, make a cine."
+    **LOOKS, no_args_is_help=True, help="Training sessions: list, export, score again, make a cine."
 )
 
 Kept = Annotated[
@@ -71,7 +71,11 @@ def export(
 ) -> None:
     """Write the sessions, or the trace of one, as CSV."""
     stored = _open(kept)
-    text = sessions_csv(stored.newest(1_000_000)) if number is None else trace_csv(stored.load(number)[2])
+    text = (
+        viewer.sessions_csv(stored.newest(1_000_000))
+        if number is None
+        else viewer.trace_csv(stored.load(number)[2])
+    )
     part = out.with_name(out.name + ".part")
     try:
         part.write_text(text, encoding="utf-8", newline="")
@@ -84,7 +88,7 @@ def export(
 def rescore(number: Number, kept: Kept = None) -> None:
     """Score a stored session again from its trace, and print both scores as JSON."""
     session, exercise, trace = _open(kept).load(number)
-    print(json.dumps({"stored": session.score, "now": score(trace, exercise).to_dict()}, indent=2))
+    print(json.dumps({"stored": session.score, "now": viewer.score(trace, exercise).to_dict()}, indent=2))
 
 
 @sessions.command()
@@ -99,16 +103,18 @@ def cine(
         raise InputError(
             f"session {number} does not say what its scene was made from, so it cannot be run again"
         )
-    scenario = validated(json.loads(session.source), f"session {number}").with_values(
+    scenario = scenario_room.validated(json.loads(session.source), f"session {number}").with_values(
         {"needle.path": keyframes(trace), "model.kind": session.model}, f"session {number}"
     )
     folder = Path.cwd()
     image = scenario.read_image(folder)
-    report = run(scenario, image, build_model(scenario, scenario.grid(image), folder=folder), out, folder)
+    report = scenario_room.run(
+        scenario, image, scenario_room.build_model(scenario, scenario.grid(image), folder=folder), out, folder
+    )
     print(f"results in {out}: {', '.join(report['files'])}")
 
 
-def keyframes(trace: Trace) -> list[tuple[float, float, float, float, float]]:
+def keyframes(trace: live_room.Trace) -> list[tuple[float, float, float, float, float]]:
     """Return the rows of time, entry and tip for a scenario's path, at most 60 a second, first and last included."""
     if len(trace) < 2:
         raise InputError("this session holds no motion")
@@ -119,8 +125,8 @@ def keyframes(trace: Trace) -> list[tuple[float, float, float, float, float]]:
     return [(float(t), float(ex), float(ey), float(tx), float(ty)) for t, ex, ey, tx, ty in columns]
 
 
-def _open(kept: Path | None) -> Sessions:
+def _open(kept: Path | None) -> viewer.Sessions:
     path = kept or default_sessions()
     if not path.exists():
         raise InputError(f"there are no sessions in {path}: finish an exercise in `echospline live` first")
-    return Sessions(path)
+    return viewer.Sessions(path)

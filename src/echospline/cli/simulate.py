@@ -13,11 +13,10 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from echospline import laboratory
+from echospline import scenario as scenario_room
 from echospline.cli.options import scenario_from, with_scenario_options
-from echospline.laboratory import rescatter
 from echospline.picture import ImageFormer
-from echospline.scenario import Scenario, build_model
-from echospline.scenario.run import run
 from echospline.scene import UltrasoundImage
 
 Out = Annotated[Path, typer.Option("--out", help="folder for the results, made where it is not there")]
@@ -56,7 +55,7 @@ def simulate_into(source: str, out: Path, changes: dict[str, Any], *, as_json: b
     """Run a scenario with a progress bar on a terminal, and print a summary."""
     scenario, folder = scenario_from(source, changes)
     image = scenario.read_image(folder)
-    model = build_model(scenario, scenario.grid(image), folder=folder)
+    model = scenario_room.build_model(scenario, scenario.grid(image), folder=folder)
     console = Console(stderr=True)
     with Progress(
         TextColumn("simulating"),
@@ -68,7 +67,7 @@ def simulate_into(source: str, out: Path, changes: dict[str, Any], *, as_json: b
         disable=as_json or not console.is_terminal,
     ) as bar:
         task = bar.add_task("simulating", total=None)
-        report = run(
+        report = scenario_room.run(
             scenario,
             image,
             model,
@@ -84,12 +83,12 @@ def simulate_into(source: str, out: Path, changes: dict[str, Any], *, as_json: b
     _print_summary(report, out)
 
 
-def _image_former(scenario: Scenario, image: UltrasoundImage) -> ImageFormer | None:
+def _image_former(scenario: scenario_room.Scenario, image: UltrasoundImage) -> ImageFormer | None:
     """Return the image former, where it is not the warp."""
     if scenario.output.image_model == "warp":
         return None
     section = scenario.phantom
-    return rescatter(
+    return laboratory.rescatter(
         image, scenario.probe.probe(), display=section.display(), angles=section.angles, seed=section.seed
     )
 

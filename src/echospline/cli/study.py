@@ -11,8 +11,9 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from echospline.study import FULL, QUICK
-from echospline.study import study as run_study
+from echospline import study as study_room
+from echospline.cli.exvivo import exvivo
+from echospline.cli.options import LOOKS
 
 
 def study(
@@ -42,8 +43,8 @@ def study(
         return
     progress = Console(stderr=True)
     command = f"echospline study{' --quick' if quick else ''} --seed {seed}"
-    result = run_study(
-        out, QUICK if quick else FULL, seed=seed, workers=workers, scheduler=scheduler, image=image, command=command,
+    result = study_room.study(
+        out, study_room.QUICK if quick else study_room.FULL, seed=seed, workers=workers, scheduler=scheduler, image=image, command=command,
         report=None if json_ else lambda what: progress.print(what, highlight=False),
     )  # fmt: skip
     if json_:
@@ -58,3 +59,8 @@ def study(
         table.add_row(claim["claim"], claim["verdict"])
     console.print(table)
     console.print(f"report: {out / 'report.html'}")
+
+
+studies = typer.Typer(**LOOKS)
+studies.callback(invoke_without_command=True)(study)
+studies.command()(exvivo)

@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING
 from echospline.menu import on_demand
 
 if TYPE_CHECKING:  # the menu, loaded on demand
-    from echospline.openigtlink.link import PORT, Link, LinkLimits
+    from echospline.openigtlink.header import PORT
+    from echospline.openigtlink.link import Link, LinkLimits
     from echospline.openigtlink.message import Message
     from echospline.openigtlink.outgoing import Looks
     from echospline.openigtlink.plus import read_calibration

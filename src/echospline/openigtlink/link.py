@@ -9,14 +9,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from echospline.errors import InputError
+from echospline.openigtlink.header import PORT
 from echospline.openigtlink.message import READABLE, Message, Request
 from echospline.openigtlink.peer import Key, Outgoing, Patience, Peer
 from echospline.openigtlink.text import NOT_FOUND, Capability, Status
 
 log = logging.getLogger("echospline.openigtlink")
 
-PORT = 18944
-"""The port of OpenIGTLink."""
 QUESTIONS = (
     "GET_STATUS",
     "GET_CAPABIL",

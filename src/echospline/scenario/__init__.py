@@ -1,7 +1,4 @@
-"""Scenario files: their tables and messages, and the models that they name.
-
-`run` is imported by its own name: it loads the writers of sequences.
-"""
+"""Scenario files: their tables and messages, the models that they name, and their runs."""
 
 from typing import TYPE_CHECKING
 
@@ -9,6 +6,7 @@ from echospline.menu import on_demand
 
 if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.scenario.models import MODELS, build_model
+    from echospline.scenario.run import run
     from echospline.scenario.scenario import LARGEST_FILE, PHANTOM, Scenario, describe, load, validated
     from echospline.scenario.sections import DiscSection, ExerciseSection
 else:
@@ -24,5 +22,6 @@ __all__ = [
     "build_model",
     "describe",
     "load",
+    "run",
     "validated",
 ]
