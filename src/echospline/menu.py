@@ -52,8 +52,8 @@ class _Room(ModuleType):
 
 def _origins(room: str) -> dict[str, tuple[str, str]]:
     """Return for each name of the menu the file it comes from and its name there."""
-    spec = find_spec(room)
-    source = spec.loader.get_source(room) if spec is not None and hasattr(spec.loader, "get_source") else None
+    loader: Any = getattr(find_spec(room), "loader", None)
+    source = loader.get_source(room) if hasattr(loader, "get_source") else None
     if source is None:
         raise ImportError(f"the source of {room} is not there: its menu is read from it")
     return {

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import sys
 from importlib import import_module
-from importlib.metadata import version
 from typing import Annotated, Any, TextIO
 
 import typer
@@ -75,6 +74,8 @@ app = typer.Typer(name="echospline", cls=_Commands, no_args_is_help=True, **LOOK
 
 def _print_version(wanted: bool) -> None:
     if wanted:
+        from importlib.metadata import version
+
         print(f"echospline {version('echospline')}")
         raise typer.Exit
 
@@ -94,13 +95,16 @@ def main() -> None:
     A reader that closes the pipe early (``| head``) has what it wanted: the command then ends with 0, quietly.
     """
     out, file = sys.stdout, _file_of(sys.stdout)
+    code: str | int | None
     try:
         code = _run()
     except SystemExit as end:
         code = end.code  # Typer's and Rich's way to end when the pipe is closed
     try:
         out.flush()
-        closed = sys.stdout is not out or _file_of(out) != file  # they put another stream or file in its place
+        closed = (
+            sys.stdout is not out or _file_of(out) != file
+        )  # they put another stream or file in its place
     except BrokenPipeError:
         closed = True
     if closed:

@@ -6,9 +6,6 @@ import json
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.table import Table
-from threadpoolctl import threadpool_limits
 
 from echospline import mechanics
 from echospline import study as study_room
@@ -20,6 +17,10 @@ def bench(
     ] = False,
 ) -> None:
     """Time steps and frames on this machine, against the display's 60 Hz and the haptic 1 kHz; under a minute."""
+    from rich.console import Console
+    from rich.table import Table
+    from threadpoolctl import threadpool_limits
+
     say = Console(stderr=True, highlight=False)
     with say.status("…") as status, threadpool_limits(1):
         rows = study_room.benchmark(status.update)

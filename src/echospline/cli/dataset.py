@@ -10,8 +10,6 @@ from time import perf_counter
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from echospline import scenario as scenario_room
 from echospline import study as study_room
@@ -42,6 +40,9 @@ def dataset(
     and `scenarios/0000000.toml` makes it again (`echospline phantom`). An interrupted run resumes,
     and a larger --n adds samples.
     """
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
     with as_file(files("echospline").joinpath("data", "dataset.toml")) as own:
         bases = [str(path.resolve()) for path in scenarios or [own]]
         shapes = {(s.phantom.grid().shape, s.mesh.nodes) for s in map(scenario_room.load, map(Path, bases))}

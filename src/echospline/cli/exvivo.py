@@ -9,22 +9,18 @@ from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
-from rich.console import Console
-from rich.progress import track as counted
-from rich.table import Table
 
+from echospline import io as io_room
 from echospline import laboratory, mechanics
+from echospline import picture as picture_room
 from echospline import scenario as scenario_room
+from echospline import scene as scene_room
 from echospline import study as study_room
 from echospline.atomic import give_name, part_of, writing
 from echospline.cli.phantom import phantom_into
 from echospline.cli.track import load, tracker
 from echospline.errors import InputError
-from echospline.io import read_displacement, read_needle
-from echospline.picture import Deformation
-from echospline.scene import Cine, EchoCine, Insertion, RegularGrid
 
 KINDS = ("tps", "elastic", "fem")
 
@@ -72,22 +68,24 @@ def exvivo(
     and finite elements are fitted to it separately (RMSE), compared frame by frame with a paired test, and used to
     predict depths outside the fit. On the phantom the truth is known, and the tracker's own error is reported too.
     """
+    import numpy as np
+
     if (cine is None) != (needle is None):
         raise InputError("--cine and --needle belong together: where the needle is in every frame")
     scene, folder = _scene(scenario)
     truth_file = None
     if cine is None:
         phantom_into(scene, out / "phantom", folder, echoes=True, quiet=json_)
-        frames: Cine | EchoCine = load(str(out / "phantom" / "echoes.npz"))
-        if b_mode and isinstance(frames, EchoCine):
+        frames: scene_room.Cine | scene_room.EchoCine = load(str(out / "phantom" / "echoes.npz"))
+        if b_mode and isinstance(frames, scene_room.EchoCine):
             display, grid = scene.phantom.display(), scene.phantom.grid()
             pictures = np.stack([echo.b_mode(display, grid).pixels for echo in frames])
-            frames = Cine(pictures, frames.times, grid, "speckle phantom")
+            frames = scene_room.Cine(pictures, frames.times, grid, "speckle phantom")
         truth_file = out / "phantom" / "displacement.npz"
         insertion = scene.insertion()
     else:
         frames = load(cine, spacing=spacing, fps=fps, crop=crop, rf=rf)
-        insertion = read_needle(needle) if needle is not None else scene.insertion()
+        insertion = io_room.read_needle(needle) if needle is not None else scene.insertion()
     result = study_exvivo(
         frames, insertion, scene, folder, out, truth_file=truth_file, method=method, depths=depths,
         distance=distance, seed=seed, quiet=json_, source=cine or "phantom driven by finite elements",
@@ -100,8 +98,8 @@ def exvivo(
 
 
 def study_exvivo(
-    frames: Cine | EchoCine,
-    insertion: Insertion,
+    frames: scene_room.Cine | scene_room.EchoCine,
+    insertion: scene_room.Insertion,
     scene: scenario_room.Scenario,
     folder: Path,
     out: Path,
@@ -115,6 +113,9 @@ def study_exvivo(
     source: str,
 ) -> dict[str, Any]:
     """Track, fit, test, draw and write the report; returns the content of ``exvivo.json``."""
+    from rich.console import Console
+    from rich.progress import track as counted
+
     wrap: Callable[[Any], Any] = (
         iter
         if quiet
@@ -124,7 +125,7 @@ def study_exvivo(
         frames, insertion, tracker(method), depths=depths, distance=distance, progress=wrap
     )  # fmt: skip
     truth = None if truth_file is None else _truth(truth_file, seen)
-    mesh = RegularGrid.covering(frames.grid, scene.mesh.nodes)
+    mesh = scene_room.RegularGrid.covering(frames.grid, scene.mesh.nodes)
     models = {kind: _fields(scene, folder, mesh, kind) for kind in KINDS}
     fits = {kind: study_room.fit(seen, model, truth, seed=seed) for kind, model in models.items()}
     wide = {
@@ -161,7 +162,7 @@ def _scene(path: Path | None) -> tuple[scenario_room.Scenario, Path]:
 
 
 def _fields(
-    scene: scenario_room.Scenario, folder: Path, mesh: RegularGrid, kind: str
+    scene: scenario_room.Scenario, folder: Path, mesh: scene_room.RegularGrid, kind: str
 ) -> Callable[[study_room.Observation], study_room.UnitFields]:
     """Build the unit fields of the model of that name; its laws are those linear in the parameters."""
     built = scenario_room.build_model(
@@ -175,9 +176,10 @@ def _fields(
 
 
 def _truth(path: Path, seen: study_room.Regions) -> list[laboratory.Displacement]:
-    record = read_displacement(path)
+    record = io_room.read_displacement(path)
     return [
-        laboratory.displacement_of(Deformation(record.grid(), record.displacement[k])) for k in seen.frames
+        laboratory.displacement_of(picture_room.Deformation(record.grid(), record.displacement[k]))
+        for k in seen.frames
     ]
 
 
@@ -187,6 +189,8 @@ def _result(
     truth: Sequence[laboratory.Displacement] | None,
     source: str,
 ) -> dict[str, Any]:
+    import numpy as np
+
     rows = []
     for i, pose in enumerate(seen.poses):
         size = np.hypot(*seen.displacement[i].T)
@@ -301,6 +305,9 @@ def _summary(means: Mapping[str, float]) -> list[dict[str, Any]]:
 
 
 def _print_summary(result: Mapping[str, Any], out: Path) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
     console = Console()
     means = result["means"]
     for title, numbers in (

@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from echospline import study as study_room
 from echospline.errors import InputError
@@ -69,6 +67,9 @@ def identify(
     that the data do not determine) and `error_map.png`. Several fields run one after another, on `--workers` or on a cluster;
     each result is written as soon as its task ends, and an interrupted run resumes.
     """
+    for field in fields:
+        if not Path(field).exists():
+            raise InputError(f"there is no file or folder {field}: expected a displacement field or a run")
     names = _names(fields)
     tasks = []
     for name, field in zip(names, fields, strict=True):
@@ -111,6 +112,9 @@ def _names(fields: list[str]) -> list[str]:
 
 
 def _print_summary(reports: dict[str, Any], out: Path) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
     console = Console()
     for name, report in reports.items():
         table = Table(title=f"{name}: {report['model']}, {report['method']}", title_justify="left")

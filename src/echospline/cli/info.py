@@ -10,8 +10,6 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from echospline import scenario as scenario_room
 from echospline.errors import InputError
@@ -48,6 +46,9 @@ def info(
     ] = LIMIT,
 ) -> None:
     """Describe a file: format, pixels, spacing, size in mm, frames and times, and doubts."""
+    from rich.console import Console
+    from rich.table import Table
+
     found = describe(file, limit)
     if as_json:
         print(json.dumps(found, indent=2))

@@ -9,16 +9,14 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
-from threadpoolctl import threadpool_limits
 
 from echospline import live as live_room
 from echospline import openigtlink
 from echospline import scenario as scenario_room
+from echospline import scene as scene_room
 from echospline.cli.options import scenario_from, with_scenario_options
 from echospline.errors import InputError
-from echospline.scene import NeedlePose, Reach, UltrasoundImage
 
 AXES = {
     "x": (1.0, 0.0, 0.0), "-x": (-1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0),
@@ -125,6 +123,8 @@ def link(
 
     Images go out at the scenario's frames per second (--fps). docs/slicer.md shows how to connect step by step.
     """
+    from threadpoolctl import threadpool_limits
+
     logging.basicConfig(
         level=logging.WARNING if quiet else logging.INFO, format="%(message)s", stream=sys.stderr, force=True
     )
@@ -141,7 +141,7 @@ def link(
         port=port,
         connect=tuple(address(text) for text in connect or ()),
         looks=openigtlink.Looks(naming, embed, scenario.needle_echo()),
-        reach=Reach(thickness=beam, contact=contact),
+        reach=scene_room.Reach(thickness=beam, contact=contact),
         rates=openigtlink.Rates(scenario.output.fps, mesh_rate),
     )
     if not options.host and not options.connect:
@@ -190,6 +190,8 @@ def make_stage(
     targets : list of (x, y)
         Points whose motion is reported, mm.
     """
+    import numpy as np
+
     image = oriented(scenario.read_image(folder), orientation)
     grid = scenario.grid(image)
     insertion = scenario.insertion()
@@ -197,7 +199,7 @@ def make_stage(
     engine = live_room.LiveEngine(
         lambda kind: scenario_room.build_model(scenario, grid, kind=kind, folder=folder),
         scenario.model.kind,
-        NeedlePose(entry, entry),
+        scene_room.NeedlePose(entry, entry),
         rate=rate,
     )
     if targets:
@@ -205,7 +207,7 @@ def make_stage(
     return openigtlink.Stage(image, engine, scenario_room.MODELS, insertion)
 
 
-def oriented(image: UltrasoundImage, orientation: str) -> UltrasoundImage:
+def oriented(image: scene_room.UltrasoundImage, orientation: str) -> scene_room.UltrasoundImage:
     """Turn a picture of another orientation to MF: columns to the marked side, rows away from the probe.
 
     Raises
@@ -213,6 +215,8 @@ def oriented(image: UltrasoundImage, orientation: str) -> UltrasoundImage:
     InputError
         If there is no such orientation.
     """
+    import numpy as np
+
     if orientation not in ORIENTATIONS:
         raise InputError(f"--orientation is one of {', '.join(ORIENTATIONS)}; got {orientation!r}")
     pixels = image.pixels
@@ -220,7 +224,7 @@ def oriented(image: UltrasoundImage, orientation: str) -> UltrasoundImage:
         pixels = pixels[:, ::-1]
     if orientation[1] == "N":
         pixels = pixels[::-1]
-    return UltrasoundImage(np.ascontiguousarray(pixels), image.grid, image.source)
+    return scene_room.UltrasoundImage(np.ascontiguousarray(pixels), image.grid, image.source)
 
 
 def _summary(stage: openigtlink.Stage) -> str:

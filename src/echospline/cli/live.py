@@ -11,16 +11,14 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from threadpoolctl import threadpool_limits
 
 from echospline import openigtlink, viewer
+from echospline import picture as picture_room
 from echospline import scenario as scenario_room
+from echospline import scene as scene_room
 from echospline.cli.link import address, make_stage
 from echospline.cli.options import scenario_from, with_scenario_options
 from echospline.errors import InputError
-from echospline.picture import NeedleEcho
-from echospline.scene import UltrasoundImage
 
 LABELS = {"tps": "TPS", "elastic": "Elastic", "green": "Green", "fem": "FEM"}
 
@@ -84,6 +82,9 @@ def live(
     Starts a server on this machine and opens its page; Ctrl+C ends it. Without an argument it shows the image that ships
     with the package. Finished exercises are kept (`echospline sessions` lists and exports them).
     """
+    from rich.console import Console
+    from threadpoolctl import threadpool_limits
+
     scenario, folder = scenario_from(source, changes or {})
     image = scenario.read_image(folder)
     scene = scene_of(scenario, image, folder)
@@ -125,7 +126,9 @@ def live(
         viewer.serve(app, settings, ready)
 
 
-def scene_of(scenario: scenario_room.Scenario, image: UltrasoundImage, folder: Path) -> viewer.Scene:
+def scene_of(
+    scenario: scenario_room.Scenario, image: scene_room.UltrasoundImage, folder: Path
+) -> viewer.Scene:
     """Build the scene of a scenario: its image, mesh and needle, every model, its exercises or the default three.
 
     Raises
@@ -155,7 +158,8 @@ def scene_of(scenario: scenario_room.Scenario, image: UltrasoundImage, folder: P
         ),
         entry=entry,
         angle=angle,
-        echo=scenario.needle_echo() or NeedleEcho(shaft=False, tip=False, tail=False, shadow=False),
+        echo=scenario.needle_echo()
+        or picture_room.NeedleEcho(shaft=False, tip=False, tail=False, shadow=False),
         exercises=tuple(scenario.exercise) or viewer.default_exercises(grid),
         source=kept.model_dump_json(),
     )

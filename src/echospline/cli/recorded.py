@@ -9,18 +9,16 @@ import os
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
-from threadpoolctl import threadpool_limits
 
 from echospline import openigtlink
+from echospline import picture as picture_room
 from echospline import scenario as scenario_room
+from echospline import scene as scene_room
 from echospline.atomic import part_of, writing
 from echospline.cli.link import axis_of
 from echospline.cli.options import scenario_from, with_scenario_options
 from echospline.errors import InputError
-from echospline.picture import simulate
-from echospline.scene import Pixels
 
 
 @with_scenario_options
@@ -55,8 +53,11 @@ def recorded(
     options. Writes `resimulated.igs.mha` and `comparison.csv`: for each frame the correlation of the recorded picture with
     the simulated one, and with the first frame (the result without a simulation).
     """
+    import numpy as np
+    from threadpoolctl import threadpool_limits
+
     # SimpleITK is slow to load
-    from echospline.io.sequence import SequenceWriter, read_sequence  # noqa: PLC0415
+    from echospline.io.sequence import SequenceWriter, read_sequence
 
     scenario, folder = scenario_from(str(file), changes or {})
     sequence = read_sequence(file)
@@ -73,7 +74,7 @@ def recorded(
     fps = max(1.0, (len(insertion.times) - 1) / span)
     rows: list[dict[str, float]] = []
     with threadpool_limits(limits=1), SequenceWriter(out / "resimulated.igs.mha", image.grid) as writer:
-        for frame in simulate(image, insertion, model, fps=fps, needle=scenario.needle_echo()):
+        for frame in picture_room.simulate(image, insertion, model, fps=fps, needle=scenario.needle_echo()):
             time = float(insertion.times[0]) + frame.time
             seen = cine.frames[int(np.argmin(np.abs(cine.times - time)))]
             writer.add(frame.image.pixels, time, frame.pose)
@@ -107,8 +108,10 @@ def recorded(
     )
 
 
-def correlation(first: Pixels, second: Pixels) -> float:
+def correlation(first: scene_room.Pixels, second: scene_room.Pixels) -> float:
     """Compute the normalised cross-correlation of two pictures, -1 to 1; 0 where one is uniform."""
+    import numpy as np
+
     a, b = first.astype(np.float64), second.astype(np.float64)
     a, b = a - a.mean(), b - b.mean()
     scale = float(np.sqrt((a * a).sum() * (b * b).sum()))

@@ -6,10 +6,7 @@ import json
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from echospline import live as live_room
 from echospline import scenario as scenario_room
@@ -35,6 +32,9 @@ def list_(
     json_: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
     """List the sessions, newest first."""
+    from rich.console import Console
+    from rich.table import Table
+
     found = _open(kept).newest()
     if json_:
         print(json.dumps([session.to_dict() for session in found], indent=2))
@@ -116,6 +116,8 @@ def cine(
 
 def keyframes(trace: live_room.Trace) -> list[tuple[float, float, float, float, float]]:
     """Return the rows of time, entry and tip for a scenario's path, at most 60 a second, first and last included."""
+    import numpy as np
+
     if len(trace) < 2:
         raise InputError("this session holds no motion")
     stride = max(1, int(1.0 / (KEYFRAMES_PER_SECOND * trace.period)))

@@ -6,18 +6,17 @@ import json
 import sys
 from importlib.resources import as_file, files
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
 
 from echospline import laboratory
 from echospline import scenario as scenario_room
 from echospline.cli.options import scenario_from, with_scenario_options
-from echospline.picture import ImageFormer
-from echospline.scene import UltrasoundImage
+
+if TYPE_CHECKING:
+    from echospline.picture import ImageFormer
+    from echospline.scene import UltrasoundImage
 
 Out = Annotated[Path, typer.Option("--out", help="folder for the results, made where it is not there")]
 Json = Annotated[bool, typer.Option("--json", help="print the report of the run as JSON, nothing else")]
@@ -56,6 +55,9 @@ def simulate_into(source: str, out: Path, changes: dict[str, Any], *, as_json: b
     scenario, folder = scenario_from(source, changes)
     image = scenario.read_image(folder)
     model = scenario_room.build_model(scenario, scenario.grid(image), folder=folder)
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
     console = Console(stderr=True)
     with Progress(
         TextColumn("simulating"),
@@ -94,6 +96,9 @@ def _image_former(scenario: scenario_room.Scenario, image: UltrasoundImage) -> I
 
 
 def _print_summary(report: dict[str, Any], out: Path) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
     console = Console()
     table = Table(title=f"{report['frames']} frames in {report['seconds']:.1f} s", title_justify="left")
     table.add_column("stage")

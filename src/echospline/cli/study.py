@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from echospline import study as study_room
 from echospline.cli.exvivo import exvivo
@@ -39,6 +37,9 @@ def study(
     Every model is compared with finite elements under the same needle, in accuracy (fitted and held-out insertions, four
     moduli in both readings) and in time per step (every method named). Cases that are in the folder already are not run again.
     """
+    from rich.console import Console
+    from rich.table import Table
+
     if context.invoked_subcommand is not None:
         return
     progress = Console(stderr=True)

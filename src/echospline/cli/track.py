@@ -11,8 +11,6 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import typer
-from rich.console import Console
-from rich.progress import track as counted
 
 from echospline import tracking
 from echospline.errors import InputError
@@ -75,6 +73,9 @@ def track(
     and frame (0 to 1); `identify` reads it. Points that lost their speckle take their neighbours' motion, and their
     confidence says so.
     """
+    from rich.console import Console
+    from rich.progress import track as counted
+
     began = perf_counter()
     frames = load(cine, spacing=spacing, fps=fps, crop=crop, rf=rf, sound_speed=sound_speed)
     path = None if needle is None else read_needle(needle)
@@ -212,7 +213,7 @@ def summary(found: tracking.Track, seconds: float) -> dict[str, Any]:
 def draw(frames: Cine | EchoCine, found: tracking.Track, poses: list[NeedlePose] | None, path: Path) -> None:
     """Draw the arrows of the frame that moved most over the first picture."""
     # matplotlib is slow to load
-    from echospline.picture.summary import tracking_figure  # noqa: PLC0415
+    from echospline.picture.summary import tracking_figure
 
     grey, _, grid = tracking.grey_pair(frames[0], frames[0])
     size = np.hypot(found.displacement[..., 0], found.displacement[..., 1]) * (found.confidence >= 0.3)

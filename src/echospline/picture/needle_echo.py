@@ -29,7 +29,7 @@ from echospline.scene import (
     as_points,
 )
 
-OUTER_DIAMETER = {
+OUTER_DIAMETER: dict[int, float] = {
     14: 2.108, 15: 1.829, 16: 1.651, 17: 1.473, 18: 1.270, 19: 1.067,
     20: 0.908, 21: 0.819, 22: 0.718, 23: 0.642, 24: 0.566, 25: 0.515,
 }  # fmt: skip

@@ -105,7 +105,9 @@ class MeshSection(Section):
     """The mesh over the image and its clamped edges."""
 
     nodes: tuple[Annotated[int, Field(ge=2, le=4096)], Annotated[int, Field(ge=2, le=4096)]] = Field(
-        (40, 30), description="nodes along x and y, corner to corner over the image"
+        (40, 30),
+        description="nodes along x and y, corner to corner over the image",
+        json_schema_extra={"between": "x"},  # as the command line takes it: 40x30
     )
     clamped: list[Literal["top", "bottom", "left", "right"]] = Field(
         ["left", "right", "bottom"], description="edges held fast; top is the probe's face"
