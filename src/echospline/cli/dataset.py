@@ -13,6 +13,7 @@ import typer
 
 from echospline import scenario as scenario_room
 from echospline import study as study_room
+from echospline.atomic import claimed
 from echospline.errors import InputError
 
 
@@ -51,26 +52,27 @@ def dataset(
                 "all bases of a dataset need the same phantom.size, phantom.pixel and mesh.nodes"
             )
         began = perf_counter()
-        # names, not paths: the dataset is the same wherever it is made
-        study_room.create_store(
-            out, scenario_room.load(Path(bases[0])), n, frames, seed, [Path(b).name for b in bases]
-        )
-        tasks = [
-            study_room.Task(
-                f"{i:07d}",
-                {"store": str(out.resolve()), "bases": bases, "index": i, "seed": seed, "frames": frames},
+        with claimed(out):
+            # names, not paths: the dataset is the same wherever it is made
+            study_room.create_store(
+                out, scenario_room.load(Path(bases[0])), n, frames, seed, [Path(b).name for b in bases]
             )
-            for i in range(n)
-        ]
-        with Progress(
-            TextColumn("samples"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
-            console=Console(stderr=True), transient=True, disable=json_,
-        ) as bar:  # fmt: skip
-            line = bar.add_task("samples", total=n)
-            outcome = study_room.sweep(
-                study_room.make_sample, tasks, out / "tasks", workers=workers, scheduler=scheduler,
-                report=lambda name: bar.advance(line),
-            )  # fmt: skip
+            tasks = [
+                study_room.Task(
+                    f"{i:07d}",
+                    {"store": str(out.resolve()), "bases": bases, "index": i, "seed": seed, "frames": frames},
+                )
+                for i in range(n)
+            ]
+            with Progress(
+                TextColumn("samples"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+                console=Console(stderr=True), transient=True, disable=json_,
+            ) as bar:  # fmt: skip
+                line = bar.add_task("samples", total=n)
+                outcome = study_room.sweep(
+                    study_room.make_sample, tasks, out / "tasks", workers=workers, scheduler=scheduler,
+                    report=lambda name: bar.advance(line),
+                )  # fmt: skip
         seconds = perf_counter() - began
     made = n - outcome.resumed - len(outcome.failed)
     report = {

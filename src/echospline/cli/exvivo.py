@@ -17,7 +17,7 @@ from echospline import picture as picture_room
 from echospline import scenario as scenario_room
 from echospline import scene as scene_room
 from echospline import study as study_room
-from echospline.atomic import give_name, part_of, writing
+from echospline.atomic import appearing, claimed
 from echospline.cli.phantom import phantom_into
 from echospline.cli.track import load, tracker
 from echospline.errors import InputError
@@ -86,10 +86,11 @@ def exvivo(
     else:
         frames = load(cine, spacing=spacing, fps=fps, crop=crop, rf=rf)
         insertion = io_room.read_needle(needle) if needle is not None else scene.insertion()
-    result = study_exvivo(
-        frames, insertion, scene, folder, out, truth_file=truth_file, method=method, depths=depths,
-        distance=distance, seed=seed, quiet=json_, source=cine or "phantom driven by finite elements",
-    )  # fmt: skip
+    with claimed(out):
+        result = study_exvivo(
+            frames, insertion, scene, folder, out, truth_file=truth_file, method=method, depths=depths,
+            distance=distance, seed=seed, quiet=json_, source=cine or "phantom driven by finite elements",
+        )  # fmt: skip
     if json_:
         json.dump(result, sys.stdout, indent=1)
         print()
@@ -137,8 +138,6 @@ def study_exvivo(
             "parameters": {kind: f.values for kind, f in wide.items()},
         }
     }
-    with writing(out):
-        out.mkdir(parents=True, exist_ok=True)
     own = None if truth is None else study_room.tracker_error(seen, truth)
     depth = [pose.depth for pose in seen.poses]
     study_room.error_per_depth(
@@ -223,10 +222,8 @@ def _result(
 
 def _write(out: Path, result: Mapping[str, Any]) -> None:
     path = out / "exvivo.json"
-    with writing(path):
-        part = part_of(path)
+    with appearing(path) as part:
         part.write_text(json.dumps(result, indent=1), encoding="utf-8")
-        give_name(part, path)
     rows = result["rows"]
     known = "tracker_rmse_mm" in rows[0]
     columns = {

@@ -8,6 +8,7 @@ import webbrowser
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import typer
@@ -24,9 +25,33 @@ LABELS = {"tps": "TPS", "elastic": "Elastic", "green": "Green", "fem": "FEM"}
 
 
 def default_sessions() -> Path:
-    """Return the file that keeps a user's training sessions."""
-    home = os.environ.get("XDG_DATA_HOME") or str(Path.home() / ".local" / "share")
-    return Path(home) / "echospline" / "sessions.sqlite"
+    """Return the file that keeps a user's training sessions.
+
+    Raises
+    ------
+    InputError
+        If the user has no home.
+    """
+    named = os.environ.get("XDG_DATA_HOME")
+    try:
+        folder = Path(named) if named else Path.home() / ".local" / "share"
+    except RuntimeError:
+        raise InputError(
+            "this user has no home folder to keep sessions in; name a file with --sessions"
+        ) from None
+    return folder / "echospline" / "sessions.sqlite"
+
+
+def _kept(sessions: Path | None, stack: ExitStack, say: Callable[[str], None]) -> viewer.Sessions:
+    """Open the file of sessions; where no file was named and the user's cannot be written, one that lasts as long as the server."""
+    if sessions is not None:
+        return viewer.Sessions(sessions)
+    try:
+        return viewer.Sessions(default_sessions())
+    except InputError as error:
+        say(f"{error}; without one, sessions last until this server ends")
+        folder = stack.enter_context(TemporaryDirectory(prefix="echospline-", ignore_cleanup_errors=True))
+        return viewer.Sessions(Path(folder) / "sessions.sqlite")
 
 
 @with_scenario_options
@@ -89,9 +114,7 @@ def live(
     image = scenario.read_image(folder)
     scene = scene_of(scenario, image, folder)
     settings = viewer.Settings(host, port, rate, clients, nodes=nodes)
-    kept = viewer.Sessions(sessions or default_sessions())
     scene.models(scene.names[0][0])  # refuses an invalid scenario before a page waits for it
-    app = viewer.build_app(scene, kept, settings, opener_for(scenario))
     console = Console(stderr=True)
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
 
@@ -102,9 +125,10 @@ def live(
             webbrowser.open(address)
 
     with ExitStack() as stack:
-        stack.enter_context(
-            threadpool_limits(limits=1)
-        )  # an engine's step is short: more threads make it slower and less punctual
+        kept = _kept(sessions, stack, lambda text: console.print(text, highlight=False, soft_wrap=True))
+        app = viewer.build_app(scene, kept, settings, opener_for(scenario))
+        # an engine's step is short: more threads make it slower and less punctual
+        stack.enter_context(threadpool_limits(limits=1))
         if link or link_connect:
             session = openigtlink.Session(
                 make_stage(scenario, folder, rate=rate),

@@ -15,6 +15,7 @@ from echospline import laboratory
 from echospline import picture as picture_room
 from echospline import scenario as scenario_room
 from echospline import scene as scene_room
+from echospline.atomic import claimed
 from echospline.cli.options import scenario_from, with_scenario_options
 from echospline.errors import InputError
 
@@ -87,6 +88,7 @@ def phantom_into(
     count = picture_room.frame_count(scenario.insertion(), scenario.output.fps)
     fps = scenario.output.fps
     with ExitStack() as stack:
+        stack.enter_context(claimed(out))
         writer = (
             stack.enter_context(
                 io_room.EchoWriter(out / "echoes.npz", count, scattered.samples, probe.carrier)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,7 +14,7 @@ from echospline import openigtlink
 from echospline import picture as picture_room
 from echospline import scenario as scenario_room
 from echospline import scene as scene_room
-from echospline.atomic import part_of, writing
+from echospline.atomic import appearing, claimed
 from echospline.cli.link import axis_of
 from echospline.cli.options import scenario_from, with_scenario_options
 from echospline.errors import InputError
@@ -73,22 +72,25 @@ def recorded(
     span = float(insertion.times[-1] - insertion.times[0])
     fps = max(1.0, (len(insertion.times) - 1) / span)
     rows: list[dict[str, float]] = []
-    with threadpool_limits(limits=1), SequenceWriter(out / "resimulated.igs.mha", image.grid) as writer:
-        for frame in picture_room.simulate(image, insertion, model, fps=fps, needle=scenario.needle_echo()):
-            time = float(insertion.times[0]) + frame.time
-            seen = cine.frames[int(np.argmin(np.abs(cine.times - time)))]
-            writer.add(frame.image.pixels, time, frame.pose)
-            rows.append(
-                {
-                    "time_s": time,
-                    "tip_x_mm": frame.pose.tip[0],
-                    "tip_y_mm": frame.pose.tip[1],
-                    "depth_mm": frame.pose.depth,
-                    "correlation_simulated": correlation(frame.image.pixels, seen),
-                    "correlation_still": correlation(image.pixels, seen),
-                }
-            )
-    _write(out / "comparison.csv", rows)
+    with claimed(out):
+        with threadpool_limits(limits=1), SequenceWriter(out / "resimulated.igs.mha", image.grid) as writer:
+            for frame in picture_room.simulate(
+                image, insertion, model, fps=fps, needle=scenario.needle_echo()
+            ):
+                time = float(insertion.times[0]) + frame.time
+                seen = cine.frames[int(np.argmin(np.abs(cine.times - time)))]
+                writer.add(frame.image.pixels, time, frame.pose)
+                rows.append(
+                    {
+                        "time_s": time,
+                        "tip_x_mm": frame.pose.tip[0],
+                        "tip_y_mm": frame.pose.tip[1],
+                        "depth_mm": frame.pose.depth,
+                        "correlation_simulated": correlation(frame.image.pixels, seen),
+                        "correlation_still": correlation(image.pixels, seen),
+                    }
+                )
+        _write(out / "comparison.csv", rows)
     told = {
         "recording": file.name,
         "frames": len(rows),
@@ -125,7 +127,5 @@ def _write(path: Path, rows: list[dict[str, float]]) -> None:
     table = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
     table.writeheader()
     table.writerows(rows)
-    part = part_of(path)
-    with writing(path):
+    with appearing(path) as part:
         part.write_text(text.getvalue(), encoding="ascii")
-        os.replace(part, path)

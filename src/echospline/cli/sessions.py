@@ -11,6 +11,7 @@ import typer
 from echospline import live as live_room
 from echospline import scenario as scenario_room
 from echospline import viewer
+from echospline.atomic import appearing, claimed
 from echospline.cli.live import default_sessions
 from echospline.cli.options import LOOKS
 from echospline.errors import InputError
@@ -76,12 +77,8 @@ def export(
         if number is None
         else viewer.trace_csv(stored.load(number)[2])
     )
-    part = out.with_name(out.name + ".part")
-    try:
+    with appearing(out) as part:
         part.write_text(text, encoding="utf-8", newline="")
-        part.replace(out)
-    except OSError as error:
-        raise InputError(f"cannot write {out}: {error.strerror}") from error
 
 
 @sessions.command()
@@ -108,9 +105,9 @@ def cine(
     )
     folder = Path.cwd()
     image = scenario.read_image(folder)
-    report = scenario_room.run(
-        scenario, image, scenario_room.build_model(scenario, scenario.grid(image), folder=folder), out, folder
-    )
+    model = scenario_room.build_model(scenario, scenario.grid(image), folder=folder)
+    with claimed(out):
+        report = scenario_room.run(scenario, image, model, out, folder)
     print(f"results in {out}: {', '.join(report['files'])}")
 
 

@@ -12,6 +12,7 @@ import typer
 
 from echospline import laboratory
 from echospline import scenario as scenario_room
+from echospline.atomic import claimed
 from echospline.cli.options import scenario_from, with_scenario_options
 
 if TYPE_CHECKING:
@@ -59,15 +60,18 @@ def simulate_into(source: str, out: Path, changes: dict[str, Any], *, as_json: b
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     console = Console(stderr=True)
-    with Progress(
-        TextColumn("simulating"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=console,
-        transient=True,
-        disable=as_json or not console.is_terminal,
-    ) as bar:
+    with (
+        claimed(out),
+        Progress(
+            TextColumn("simulating"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+            console=console,
+            transient=True,
+            disable=as_json or not console.is_terminal,
+        ) as bar,
+    ):
         task = bar.add_task("simulating", total=None)
         report = scenario_room.run(
             scenario,

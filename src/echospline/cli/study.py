@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from echospline import study as study_room
+from echospline.atomic import claimed
 from echospline.cli.exvivo import exvivo
 from echospline.cli.options import LOOKS
 
@@ -44,10 +45,11 @@ def study(
         return
     progress = Console(stderr=True)
     command = f"echospline study{' --quick' if quick else ''} --seed {seed}"
-    result = study_room.study(
-        out, study_room.QUICK if quick else study_room.FULL, seed=seed, workers=workers, scheduler=scheduler, image=image, command=command,
-        report=None if json_ else lambda what: progress.print(what, highlight=False),
-    )  # fmt: skip
+    with claimed(out):
+        result = study_room.study(
+            out, study_room.QUICK if quick else study_room.FULL, seed=seed, workers=workers, scheduler=scheduler, image=image, command=command,
+            report=None if json_ else lambda what: progress.print(what, highlight=False),
+        )  # fmt: skip
     if json_:
         json.dump(result, sys.stdout, indent=1)
         print()

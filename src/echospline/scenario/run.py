@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from echospline.atomic import give_name, part_of
-from echospline.errors import InputError
+from echospline.atomic import appearing, writing
 from echospline.io import DisplacementWriter, open_writer
 from echospline.io.sequence import SequenceWriter
 from echospline.mechanics import describe_core
@@ -103,10 +102,8 @@ def run(
         If the folder cannot be written.
     """
     began = perf_counter()
-    try:
+    with writing(out):
         out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot make the folder {out} for the results: {error.strerror}") from error
     insertion, output = scenario.insertion(), scenario.output
     count = frame_count(insertion, output.fps)
     tally, files = _Tally(), []
@@ -190,9 +187,8 @@ def run(
         "core": describe_core(),
         "parameters": scenario.model_dump(mode="json"),
     }
-    part = part_of(out / "run.json")
-    part.write_text(json.dumps(report, indent=2), encoding="utf-8")
-    give_name(part, out / "run.json")
+    with appearing(out / "run.json") as part:
+        part.write_text(json.dumps(report, indent=2), encoding="utf-8")
     return report
 
 

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
-from echospline.atomic import give_name, part_of
+from echospline.atomic import appearing
 from echospline.errors import InputError
 from echospline.picture import NeedleEcho
 from echospline.scenario.messages import describe as _describe
@@ -148,9 +148,8 @@ class Scenario(Section):
             image = os.path.relpath((folder / self.image.file).resolve(), path.parent.resolve())
             moved = self.model_copy(update={"image": self.image.model_copy(update={"file": image})})
         _write_section(tomlkit, document, moved)
-        part = part_of(path)
-        part.write_text(tomlkit.dumps(document), encoding="utf-8")
-        give_name(part, path)
+        with appearing(path) as part:
+            part.write_text(tomlkit.dumps(document), encoding="utf-8")
 
 
 def load(path: str | Path) -> Scenario:

@@ -14,7 +14,7 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-from echospline.atomic import give_name, part_of, writing
+from echospline.atomic import appearing
 from echospline.errors import EchosplineError
 from echospline.io import read_image
 from echospline.mechanics import FEMModel, GreenModel, ThinPlate
@@ -238,24 +238,18 @@ def _fitted_to(image: UltrasoundImage, grid: RegularGrid) -> UltrasoundImage:
 
 
 def _write(path: Path, text: str) -> None:
-    with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part = part_of(path)
+    with appearing(path) as part:
         part.write_text(text, encoding="utf-8")
-        give_name(part, path)
 
 
 def _write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     columns = list(dict.fromkeys(key for row in rows for key in row))
-    with writing(path):
-        part = part_of(path)
-        with part.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, columns)
-            writer.writeheader()
-            writer.writerows(
-                {k: json.dumps(v) if isinstance(v, dict) else v for k, v in row.items()} for row in rows
-            )
-        give_name(part, path)
+    with appearing(path) as part, part.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, columns)
+        writer.writeheader()
+        writer.writerows(
+            {k: json.dumps(v) if isinstance(v, dict) else v for k, v in row.items()} for row in rows
+        )
 
 
 _ACCURACY = {
