@@ -14,6 +14,7 @@ import typer
 from echospline import scenario as scenario_room
 from echospline import study as study_room
 from echospline.atomic import claimed
+from echospline.cli.options import say
 from echospline.errors import InputError
 
 
@@ -47,10 +48,15 @@ def dataset(
     with as_file(files("echospline").joinpath("data", "dataset.toml")) as own:
         bases = [str(path.resolve()) for path in scenarios or [own]]
         shapes = {(s.phantom.grid().shape, s.mesh.nodes) for s in map(scenario_room.load, map(Path, bases))}
+        for base in bases:
+            first = scenario_room.load(Path(base))
+            say(scenario_room.needle_doubts(first.insertion(), first.phantom.grid()))
+        (nx, ny), (mx, my) = next(iter(shapes))
         if len(shapes) > 1:
             raise InputError(
                 "all bases of a dataset need the same phantom.size, phantom.pixel and mesh.nodes"
             )
+        say(scenario_room.check_store(n, frames * (2 * nx * ny + 8 * mx * my + 48), out))
         began = perf_counter()
         with claimed(out):
             # names, not paths: the dataset is the same wherever it is made

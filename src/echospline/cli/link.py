@@ -15,7 +15,7 @@ from echospline import live as live_room
 from echospline import openigtlink
 from echospline import scenario as scenario_room
 from echospline import scene as scene_room
-from echospline.cli.options import scenario_from, with_scenario_options
+from echospline.cli.options import say, scenario_from, with_scenario_options
 from echospline.errors import InputError
 
 AXES = {
@@ -147,6 +147,8 @@ def link(
     if not options.host and not options.connect:
         raise InputError("nothing to do: with --no-serve give --connect HOST:PORT")
     stage = make_stage(scenario, folder, orientation, rate, [_point(text) for text in target or ()])
+
+    say(scenario_room.size_doubts(stage.image.grid))
 
     def load_named(name: str) -> openigtlink.Stage:
         assert scenarios is not None  # otherwise it is not passed on

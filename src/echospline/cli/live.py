@@ -18,7 +18,7 @@ from echospline import picture as picture_room
 from echospline import scenario as scenario_room
 from echospline import scene as scene_room
 from echospline.cli.link import address, make_stage
-from echospline.cli.options import scenario_from, with_scenario_options
+from echospline.cli.options import say, scenario_from, with_scenario_options
 from echospline.errors import InputError
 
 LABELS = {"tps": "TPS", "elastic": "Elastic", "green": "Green", "fem": "FEM"}
@@ -112,6 +112,7 @@ def live(
 
     scenario, folder = scenario_from(source, changes or {})
     image = scenario.read_image(folder)
+    say(scenario_room.size_doubts(image.grid))
     scene = scene_of(scenario, image, folder)
     settings = viewer.Settings(host, port, rate, clients, nodes=nodes)
     scene.models(scene.names[0][0])  # refuses an invalid scenario before a page waits for it

@@ -6,7 +6,8 @@ The help text, range and default of every option come from the scenario's own ta
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -99,6 +100,7 @@ OPTIONS = (
     Option("--fps", "output.fps", "N", None, "Output"),
     Option("--formats", "output.formats", "NAME,...", _words, "Output"),
     Option("--border", "output.border", "VALUE", _border, "Output"),
+    Option("--window", "output.window", "LOW,HIGH", _numbers, "Output"),
     Option("--folding", "output.folding", "flag|refuse", None, "Output"),
     Option("--image-model", "output.image_model", "warp|rescatter", None, "Output"),
     Option("--needle/--no-needle", "output.needle", "", None, "Output"),
@@ -141,6 +143,12 @@ def with_scenario_options(command: Callable[..., None]) -> Callable[..., None]:
     named.__signature__ = inspect.Signature([*own, *extra])
     named.__annotations__ = {p.name: p.annotation for p in (*own, *extra)}
     return wrapped
+
+
+def say(doubts: Iterable[str]) -> None:
+    """Print doubts on stderr, one line each."""
+    for doubt in doubts:
+        print(f"echospline: doubt: {doubt}", file=sys.stderr)
 
 
 class ScenarioCommand(TyperCommand):

@@ -16,7 +16,7 @@ from echospline import picture as picture_room
 from echospline import scenario as scenario_room
 from echospline import scene as scene_room
 from echospline.atomic import claimed
-from echospline.cli.options import scenario_from, with_scenario_options
+from echospline.cli.options import say, scenario_from, with_scenario_options
 from echospline.errors import InputError
 
 
@@ -84,6 +84,8 @@ def phantom_into(
     image = scene_room.UltrasoundImage(
         still.b_mode(display, scattered.grid).pixels, scattered.grid, "speckle phantom"
     )
+    scenario, doubts = scenario_room.prepared(scenario, image, out)
+    say(doubts)
     model = scenario_room.build_model(scenario, scenario.grid(image), folder=folder)
     count = picture_room.frame_count(scenario.insertion(), scenario.output.fps)
     fps = scenario.output.fps
@@ -114,7 +116,7 @@ def phantom_into(
         former = laboratory.phantom_pictures(
             scattered, display=display, fps=fps, out_of_plane=section.out_of_plane, record=record
         )
-        report = scenario_room.run(scenario, image, model, out, folder, form_image=former)
+        report = scenario_room.run(scenario, image, model, out, folder, form_image=former, doubts=doubts)
     report["phantom"] = described(scattered, still)
     report["files"] += [name for name, made in (("echoes.npz", echoes), ("rf.mha", rf)) if made]
     return report

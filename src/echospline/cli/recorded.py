@@ -16,7 +16,7 @@ from echospline import scenario as scenario_room
 from echospline import scene as scene_room
 from echospline.atomic import appearing, claimed
 from echospline.cli.link import axis_of
-from echospline.cli.options import scenario_from, with_scenario_options
+from echospline.cli.options import say, scenario_from, with_scenario_options
 from echospline.errors import InputError
 
 
@@ -68,6 +68,7 @@ def recorded(
         axis=axis_of(needle_axis),
         calibration=openigtlink.read_calibration(config) if config else None,
     )
+    say(scenario_room.size_doubts(image.grid) + scenario_room.needle_doubts(insertion, image.grid))
     model = scenario_room.build_model(scenario, scenario.grid(image), folder=folder)
     span = float(insertion.times[-1] - insertion.times[0])
     fps = max(1.0, (len(insertion.times) - 1) / span)

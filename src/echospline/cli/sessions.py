@@ -13,7 +13,7 @@ from echospline import scenario as scenario_room
 from echospline import viewer
 from echospline.atomic import appearing, claimed
 from echospline.cli.live import default_sessions
-from echospline.cli.options import LOOKS
+from echospline.cli.options import LOOKS, say
 from echospline.errors import InputError
 
 sessions = typer.Typer(
@@ -105,9 +105,11 @@ def cine(
     )
     folder = Path.cwd()
     image = scenario.read_image(folder)
+    scenario, doubts = scenario_room.prepared(scenario, image, out)
+    say(doubts)
     model = scenario_room.build_model(scenario, scenario.grid(image), folder=folder)
     with claimed(out):
-        report = scenario_room.run(scenario, image, model, out, folder)
+        report = scenario_room.run(scenario, image, model, out, folder, doubts=doubts)
     print(f"results in {out}: {', '.join(report['files'])}")
 
 

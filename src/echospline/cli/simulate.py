@@ -13,7 +13,7 @@ import typer
 from echospline import laboratory
 from echospline import scenario as scenario_room
 from echospline.atomic import claimed
-from echospline.cli.options import scenario_from, with_scenario_options
+from echospline.cli.options import say, scenario_from, with_scenario_options
 
 if TYPE_CHECKING:
     from echospline.picture import ImageFormer
@@ -55,6 +55,8 @@ def simulate_into(source: str, out: Path, changes: dict[str, Any], *, as_json: b
     """Run a scenario with a progress bar on a terminal, and print a summary."""
     scenario, folder = scenario_from(source, changes)
     image = scenario.read_image(folder)
+    scenario, doubts = scenario_room.prepared(scenario, image, out)
+    say(doubts)
     model = scenario_room.build_model(scenario, scenario.grid(image), folder=folder)
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -81,6 +83,7 @@ def simulate_into(source: str, out: Path, changes: dict[str, Any], *, as_json: b
             folder,
             progress=lambda done, count: bar.update(task, completed=done, total=count),
             form_image=_image_former(scenario, image),
+            doubts=doubts,
         )
     if as_json:
         json.dump(report, sys.stdout, indent=2)

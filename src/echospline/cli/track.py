@@ -12,7 +12,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import typer
 
+from echospline import scenario as scenario_room
 from echospline import tracking
+from echospline.cli.options import say
 from echospline.errors import InputError
 from echospline.io import head, read, read_echoes, read_needle
 from echospline.scene import Cine, Echo, EchoCine, Floats, NeedlePose, RegularGrid
@@ -78,6 +80,8 @@ def track(
 
     began = perf_counter()
     frames = load(cine, spacing=spacing, fps=fps, crop=crop, rf=rf, sound_speed=sound_speed)
+    say(scenario_room.size_doubts(frames.grid, "--spacing"))
+    scenario_room.check_points(frames.grid, grid, len(frames), "--grid")
     path = None if needle is None else read_needle(needle)
     poses = None if path is None else [path.pose(t) for t in frames.times]
     if ahead is not None and poses is None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from echospline.atomic import give_name, part_of, writing
 from echospline.errors import InputError
-from echospline.scene import Pixels, RegularGrid
+from echospline.scene import Pixels, RegularGrid, is_number
 
 FORMATS = (".mp4", ".gif", ".mha")
 
@@ -186,7 +186,7 @@ def open_writer(
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if not (isfinite(fps) and fps > 0):
+    if not (is_number(fps) and fps > 0):
         raise InputError(f"fps must be a positive number of frames per second; got {fps}")
     if window is not None and not (len(window) == 2 and np.isfinite(window).all() and window[0] < window[1]):
         raise InputError(f"window must be two pixel values, low before high; got {window}")

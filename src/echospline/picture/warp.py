@@ -8,7 +8,7 @@ import numpy as np
 
 from echospline.errors import FoldingError, InputError
 from echospline.picture.deformation import Deformation, Folds, InverseMap
-from echospline.picture.native import LARGEST, Border, NativePicture, drawable
+from echospline.picture.native import LARGEST, Border, NativePicture, check_border, drawable
 from echospline.scene import Pixels, UltrasoundImage
 
 Interpolation = Literal["linear", "nearest", "cubic"]
@@ -59,6 +59,7 @@ def warp(
         raise InputError(f"interpolation is one of {', '.join(INTERPOLATIONS)}; got {interpolation!r}")
     if folding not in ("flag", "refuse"):
         raise InputError(f'folding is "flag" or "refuse"; got {folding!r}')
+    check_border(border, image.pixels)
     if isinstance(deformation, Deformation):
         if interpolation != "cubic" and in_core(image, border):
             picture = NativePicture(

@@ -7,6 +7,14 @@ from echospline.menu import on_demand
 if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.scenario.models import MODELS, build_model
     from echospline.scenario.run import run
+    from echospline.scenario.scale import (
+        check,
+        check_points,
+        check_store,
+        needle_doubts,
+        prepared,
+        size_doubts,
+    )
     from echospline.scenario.scenario import LARGEST_FILE, PHANTOM, Scenario, describe, load, validated
     from echospline.scenario.sections import DiscSection, ExerciseSection
 else:
@@ -20,8 +28,14 @@ __all__ = [
     "ExerciseSection",
     "Scenario",
     "build_model",
+    "check",
+    "check_points",
+    "check_store",
     "describe",
     "load",
+    "needle_doubts",
+    "prepared",
     "run",
+    "size_doubts",
     "validated",
 ]

@@ -63,6 +63,14 @@ def build_model(
         kernel = Elastic(nu, section.radius, tissue.plane)
     if kind in ("tps", "elastic"):
         anchors = Clamps.of(grid, clamped, points).anchors(parameters.anchor_spacing)
-        stiffness = None if tissue.homogeneous else landmark_stiffness(tissue, grid, kernel, anchors)
-        return TPSModel(grid, clamped, parameters, kernel, clamped_points=points, stiffness=stiffness)
+        try:
+            stiffness = None if tissue.homogeneous else landmark_stiffness(tissue, grid, kernel, anchors)
+            return TPSModel(grid, clamped, parameters, kernel, clamped_points=points, stiffness=stiffness)
+        except InputError as error:
+            if "on one line" not in str(error):
+                raise
+            raise InputError(
+                f"mesh.clamped = {list(clamped)} (--clamped) does not hold a thin plate spline: {error}; clamp a second edge, "
+                "or use the model fem or elastic, which one edge holds"
+            ) from None
     raise InputError(f"a model is one of {', '.join(MODELS)}; got {kind!r}")

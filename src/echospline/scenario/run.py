@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -52,13 +52,21 @@ class _Tally:
 
 
 def _sink(
-    name: str, stack: ExitStack, out: Path, image: UltrasoundImage, fps: float
+    name: str,
+    stack: ExitStack,
+    out: Path,
+    image: UltrasoundImage,
+    fps: float,
+    window: tuple[float, float] | None,
 ) -> Callable[[Frame], None]:
     """Open the writer of one format."""
     if name in ("igs.mha", "seq.nrrd"):  # for PLUS and 3D Slicer: pictures with the needle's transforms
         recording = stack.enter_context(SequenceWriter(out / SUFFIX[name], image.grid))
         return lambda frame: recording.add(frame.image.pixels, frame.time, frame.pose)
-    cine = stack.enter_context(open_writer(out / SUFFIX[name], image.grid, fps))
+    narrow = name != "mha" and (window is not None)
+    cine = stack.enter_context(
+        open_writer(out / SUFFIX[name], image.grid, fps, window=window if narrow else None)
+    )
     return lambda frame: cine.add(frame.image.pixels, frame.time)
 
 
@@ -71,6 +79,7 @@ def run(
     *,
     progress: Callable[[int, int], None] | None = None,
     form_image: ImageFormer | None = None,
+    doubts: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Simulate a scenario and write its results.
 
@@ -90,6 +99,8 @@ def run(
         Called with (frames done, number of frames).
     form_image : callable, optional
         See `simulate`.
+    doubts : sequence of str
+        What was said before the run (see `prepared`); kept in the report.
 
     Returns
     -------
@@ -114,7 +125,7 @@ def run(
         sinks = []
         for name in dict.fromkeys(output.formats):
             files.append(SUFFIX[name])
-            sinks.append(_sink(name, stack, out, image, output.fps))
+            sinks.append(_sink(name, stack, out, image, output.fps, output.window))
         record = None
         if output.displacement:
             files.append("displacement.npz")
@@ -173,6 +184,7 @@ def run(
         "largest_displacement_mm": tally.largest,
         "inverse_map_residual_px": tally.residual,
         "folded_frames": tally.folded,
+        "doubts": list(doubts),
         "milliseconds_per_frame": {
             name: {
                 "median": float(np.median(ms)),

@@ -20,6 +20,7 @@ from echospline.picture import NeedleEcho
 from echospline.scenario.messages import describe as _describe
 from echospline.scenario.messages import sentence, shown
 from echospline.scenario.phantom_section import PhantomSection, ProbeSection
+from echospline.scenario.scale import size_doubts
 from echospline.scenario.sections import (
     ExerciseSection,
     ImageSection,
@@ -85,14 +86,22 @@ class Scenario(Section):
         return validated(tree, origin)
 
     def read_image(self, folder: Path) -> UltrasoundImage:
-        """Read the image; a relative path starts at ``folder``; sample:phantom is [phantom] at rest."""
+        """Read the image; a relative path starts at ``folder``; sample:phantom is [phantom] at rest.
+
+        Raises
+        ------
+        InputError
+            If it cannot be read, or has a size that no ultrasound picture has.
+        """
         section = self.image
         if section.file == PHANTOM:
             return self.phantom.still(self.probe.probe())
         from echospline.io import read_image  # noqa: PLC0415  (a wrong key is said before readers are loaded)
 
         name = section.file if section.file.startswith("sample:") else str(folder / section.file)
-        return read_image(name, spacing=section.spacing, frame=section.frame, region=section.region)
+        image = read_image(name, spacing=section.spacing, frame=section.frame, region=section.region)
+        size_doubts(image.grid)  # refuses what no scene can be, before anything is made of it
+        return image
 
     def grid(self, image: UltrasoundImage) -> RegularGrid:
         """Lay the mesh over the image."""

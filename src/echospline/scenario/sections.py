@@ -265,6 +265,10 @@ class OutputSection(Section):
     border: Annotated[float, Field(ge=0)] | Literal["transparent"] = Field(
         0.0, description="value where no tissue comes to lie"
     )
+    window: tuple[float, float] | None = Field(
+        None,
+        description="pixel values shown as black and white where a format holds 8 bits; chosen where needed and not given",
+    )
     folding: Literal["flag", "refuse"] = Field("flag", description="what happens when the picture folds")
     inverse: Literal["auto", "exact"] = Field(
         "auto", description="origins of pixels: interpolated where good to 0.1 pixel, or each traced exactly"

@@ -11,6 +11,7 @@ if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.scene.imaging_plane import AXIAL, ImagingPlane, Reach, TrackedNeedle, Visible
     from echospline.scene.metrics import MOVED, FieldError, distance, field_error
     from echospline.scene.needle import ZERO_LENGTH, Insertion, NeedlePose
+    from echospline.scene.number import is_number
     from echospline.scene.tissue import Circle, Label, Layer, Polygon, Region, Shape, Tissue
     from echospline.scene.transducer import FWHM, TRANSDUCERS, Transducer
     from echospline.scene.transform import as_transform, frames_of, transform_between
@@ -54,5 +55,6 @@ __all__ = [
     "field_error",
     "fourier_frequencies",
     "frames_of",
+    "is_number",
     "transform_between",
 ]

@@ -19,6 +19,7 @@ from echospline.errors import EchosplineError
 from echospline.io import read_image
 from echospline.mechanics import FEMModel, GreenModel, ThinPlate
 from echospline.picture import Deformation, warp
+from echospline.scenario import size_doubts
 from echospline.scene import RegularGrid, UltrasoundImage
 from echospline.study.accuracy import (
     CLAMPED,
@@ -165,7 +166,9 @@ def figure_2(out: Path, extent: Extent, seed: int, image: str) -> None:
         "TPS": observe(tps, times, poses).displacement[-1],
         "Green": observe(green, times, poses).displacement[-1],
     }
-    picture = _fitted_to(read_image(image), grid)
+    found = read_image(image)
+    size_doubts(found.grid, "the image's spacing")  # refuses what no picture can be
+    picture = _fitted_to(found, grid)
     images = {"at rest": picture} | {
         f"deformed by {name}": warp(picture, Deformation(grid, u))
         for name, u in fields.items()
