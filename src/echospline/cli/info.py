@@ -25,6 +25,7 @@ from echospline.io import (
     read_displacement,
     sample_image,
 )
+from echospline.scene import RegularGrid
 
 
 def info(
@@ -138,8 +139,22 @@ def _of_recording(recording: Recording) -> dict[str, Any]:
             {"content": r.content, "box": list(r.box), "spacing_mm": list(r.spacing) if r.spacing else None}
             for r in recording.regions
         ]
-    about["notes"] = [*recording.notes, *_missing(recording)]
+    about["notes"] = [
+        *recording.notes,
+        *_missing(recording),
+        *_size_doubts(right - left, bottom - top, recording),
+    ]
     return about
+
+
+def _size_doubts(columns: int, rows: int, recording: Recording) -> list[str]:
+    """Return what other commands say of the picture's size, or refuse it for."""
+    if recording.spacing is None:
+        return []
+    try:
+        return scenario_room.size_doubts(RegularGrid((columns, rows), recording.spacing))
+    except InputError as error:
+        return [str(error)]
 
 
 def _missing(recording: Recording) -> list[str]:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from echospline.errors import InputError
-from echospline.picture import frame_count
+from echospline.picture import check_border, frame_count
 from echospline.scene import Floats, Insertion, RegularGrid, UltrasoundImage
 
 if TYPE_CHECKING:
@@ -75,10 +75,10 @@ def size_doubts(grid: RegularGrid, key: str = "image.spacing (--spacing)") -> li
     InputError
         If no ultrasound picture can have this size.
     """
-    sides = [n * h for n, h in zip(grid.shape, grid.spacing, strict=True)]
+    sides = [round(n * h, 9) for n, h in zip(grid.shape, grid.spacing, strict=True)]
     if all(LEAST <= side <= MOST for side in sides):
         return []
-    told = f"the picture is {sides[0]:.4g} mm wide and {sides[1]:.4g} mm deep; expected {LEAST:g} to {MOST:g} mm a side"
+    told = f"the picture is {_length(sides[0])} wide and {_length(sides[1])} deep; expected {LEAST:g} to {MOST:g} mm a side"
     given = " x ".join(f"{h:.4g}" for h in grid.spacing)
     hint = f"check {key}, mm per pixel, here {given}"
     for unit, factor in _UNITS.items():
@@ -164,7 +164,7 @@ def cost_of(scenario: Scenario, image: UltrasoundImage) -> Cost:
     """Count what a run of a scenario takes; nothing is allocated."""
     output = scenario.output
     frames = frame_count(scenario.insertion(), output.fps)
-    steps = frames * max(1, ceil(1.0 / output.fps / output.longest_step - 1e-9))
+    steps = (frames - 1) * max(1, ceil(1.0 / output.fps / output.longest_step - 1e-9))
     pixels, nodes = image.pixels.nbytes, scenario.mesh.nodes[0] * scenario.mesh.nodes[1]
     on_disk = frames * (
         sum(_SHARE[name] * pixels for name in output.formats) + 32.0 * nodes * output.displacement
@@ -196,16 +196,19 @@ def check(scenario: Scenario, image: UltrasoundImage, out: Path | None = None) -
     Raises
     ------
     InputError
-        If the run cannot be meant, or needs more memory or disk than there is.
+        If the run cannot be meant, its border is none of its pixels, or it needs more memory or disk than there is.
     """
     insertion = scenario.insertion()
+    check_border(scenario.output.border, image.pixels)
     doubts = size_doubts(image.grid) + needle_doubts(insertion, image.grid)
     cost = cost_of(scenario, image)
     needle, output = scenario.needle, scenario.output
     speed = needle.speed if isinstance(needle.speed, float) else inf
     hint = ""
     if needle.path is None and speed < SLOW:
-        hint = f"; {speed:g} mm/s is slow: was {speed:g} m/s meant, which is {1000 * speed:g} mm/s?"
+        hint = f"; needle.speed = {speed:g} mm/s is very slow"
+        if 1000 * speed >= SLOW:
+            hint += f": was {speed:g} m/s meant, which is {1000 * speed:g} mm/s?"
     why = f"{insertion.duration:,.6g} s of insertion (needle.depth, needle.speed, needle.dwell) at output.fps = {output.fps:g}"
     if cost.frames > MOST_FRAMES:
         raise InputError(f"{why} are {cost.frames:,} frames; expected {MOST_FRAMES:,} at most{hint}")
@@ -342,6 +345,10 @@ def _free(folder: Path) -> float:
         return float(shutil.disk_usage(there).free)
     except OSError:
         return inf
+
+
+def _length(mm: float) -> str:
+    return f"{mm:,.0f} mm" if mm >= 1000 else f"{mm:.4g} mm"
 
 
 def _sized(count: float) -> str:
