@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from echospline.mechanics.finite_elements import (
+    METHOD,
     Integration,
     Method,
     factor,
@@ -62,7 +63,7 @@ class FEMModel:
     forces : NeedleForces
         What the needle exerts.
     solver : {"cholmod", "superlu"}
-        See `finite_elements.factor`.
+        See `finite_elements.factor`; CHOLMOD where it is installed, else SuperLU. ``model.factored.method`` says which.
     clamped_points : array_like, shape (k, 2), optional
         Further points held fast, mm: the mesh nodes nearest to them.
     integration : {"full", "selective"}, optional
@@ -82,7 +83,7 @@ class FEMModel:
         forces: NeedleForces | None = None,
         *,
         clamped_points: ArrayLike | None = None,
-        solver: Method = "cholmod",
+        solver: Method = METHOD,
         integration: Integration | None = None,
     ) -> None:
         self._grid = grid

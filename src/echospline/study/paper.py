@@ -9,13 +9,14 @@ import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from threadpoolctl import threadpool_limits
 
 from echospline.atomic import appearing
-from echospline.errors import EchosplineError
+from echospline.errors import EchosplineError, MissingExtraError
 from echospline.io import read_image
 from echospline.mechanics import FEMModel, GreenModel, ThinPlate
 from echospline.picture import Deformation, warp
@@ -124,7 +125,14 @@ def study(
     -------
     dict
         ``accuracy``, ``speed``, ``savings``, ``identification`` and ``claims`` as written.
+
+    Raises
+    ------
+    MissingExtraError
+        If kvxopt, which the times are compared with, is not installed.
     """
+    if find_spec("kvxopt") is None:
+        raise MissingExtraError("kvxopt", "cholmod", "the study's comparison of times with CHOLMOD")
     say = report or (lambda _: None)
     tasks = _tasks(extent, seed)
     where = {"workers": workers, "scheduler": scheduler}
