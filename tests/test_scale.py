@@ -164,6 +164,8 @@ def test_a_long_run_says_what_it_will_cost():
     for word in ("frames", "GiB on the disk", "min on a machine", "0.005 m/s meant"):
         assert word in said
     assert prepared(Scenario(), image_of("uint8", 255))[1] == []
+    scattered = Scenario().with_values({"output.image_model": "rescatter", "needle.speed": 1.0})
+    assert any("long run" in doubt for doubt in prepared(scattered, image_of("uint8", 255))[1])
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from echospline import scenario as scenario_room
 from echospline import scene as scene_room
 from echospline import study as study_room
 from echospline.atomic import appearing, claimed
+from echospline.cli.options import say
 from echospline.cli.phantom import phantom_into
 from echospline.cli.track import load, tracker
 from echospline.errors import InputError
@@ -86,6 +87,10 @@ def exvivo(
     else:
         frames = load(cine, spacing=spacing, fps=fps, crop=crop, rf=rf)
         insertion = io_room.read_needle(needle) if needle is not None else scene.insertion()
+    say(
+        scenario_room.size_doubts(frames.grid, "--spacing")
+        + scenario_room.needle_doubts(insertion, frames.grid)
+    )
     with claimed(out):
         result = study_exvivo(
             frames, insertion, scene, folder, out, truth_file=truth_file, method=method, depths=depths,

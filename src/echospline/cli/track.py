@@ -83,6 +83,8 @@ def track(
     say(scenario_room.size_doubts(frames.grid, "--spacing"))
     scenario_room.check_points(frames.grid, grid, len(frames), "--grid")
     path = None if needle is None else read_needle(needle)
+    if path is not None:
+        say(scenario_room.needle_doubts(path, frames.grid))
     poses = None if path is None else [path.pose(t) for t in frames.times]
     if ahead is not None and poses is None:
         raise InputError("--ahead needs --needle: the region travels before its tip")

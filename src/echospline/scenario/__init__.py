@@ -8,6 +8,7 @@ if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.scenario.models import MODELS, build_model
     from echospline.scenario.run import run
     from echospline.scenario.scale import (
+        PHANTOM,
         check,
         check_points,
         check_store,
@@ -15,7 +16,7 @@ if TYPE_CHECKING:  # the menu, loaded on demand
         prepared,
         size_doubts,
     )
-    from echospline.scenario.scenario import LARGEST_FILE, PHANTOM, Scenario, describe, load, validated
+    from echospline.scenario.scenario import LARGEST_FILE, Scenario, describe, load, validated
     from echospline.scenario.sections import DiscSection, ExerciseSection
 else:
     on_demand(__name__)

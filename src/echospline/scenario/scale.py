@@ -24,6 +24,8 @@ from echospline.scene import Floats, Insertion, RegularGrid, UltrasoundImage
 if TYPE_CHECKING:
     from echospline.scenario.scenario import Scenario
 
+PHANTOM = "sample:phantom"
+"""Name of the image that is made from [phantom]."""
 LEAST, MOST = 5.0, 500.0
 """mm a side: ultrasound pictures are not smaller or larger; beyond, a doubt."""
 ABSURD = 10.0
@@ -57,8 +59,8 @@ _FEM_BYTES = 6_500
 """Memory of finite elements per node: measured from 10 000 to 160 000 nodes, factor and assembly."""
 _STEP, _FEM_STEP = 7e-4, 1e-6
 """s per step of the model, and per step and node of finite elements; measured on one core, orders of magnitude."""
-_PIXEL, _WRITE = 1e-8, 3e-8
-"""s per pixel and frame to draw, and to write one format."""
+_PIXEL, _WRITE, _FORMED = 1e-8, 3e-8, 5e-6
+"""s per pixel and frame to draw, to write one format, and to form a picture of scatterers."""
 
 
 def size_doubts(grid: RegularGrid, key: str = "image.spacing (--spacing)") -> list[str]:
@@ -172,7 +174,8 @@ def cost_of(scenario: Scenario, image: UltrasoundImage) -> Cost:
     )
     fem = scenario.model.kind == "fem"
     per_step = _STEP + _FEM_STEP * nodes * fem
-    per_frame = image.grid.size * (_PIXEL + _WRITE * len(output.formats))
+    formed = output.image_model == "rescatter" or scenario.image.file == PHANTOM
+    per_frame = image.grid.size * (_PIXEL + _WRITE * len(output.formats) + _FORMED * formed)
     return Cost(
         frames,
         steps,

@@ -20,7 +20,7 @@ from echospline.picture import NeedleEcho
 from echospline.scenario.messages import describe as _describe
 from echospline.scenario.messages import sentence, shown
 from echospline.scenario.phantom_section import PhantomSection, ProbeSection
-from echospline.scenario.scale import size_doubts
+from echospline.scenario.scale import PHANTOM, size_doubts
 from echospline.scenario.sections import (
     ExerciseSection,
     ImageSection,
@@ -45,7 +45,6 @@ from echospline.scene import (
     UltrasoundImage,
 )
 
-PHANTOM = "sample:phantom"
 LARGEST_FILE = 1_000_000
 """Bytes; a scenario is a page of text."""
 
