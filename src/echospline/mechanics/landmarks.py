@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from math import inf, isfinite
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -52,7 +52,10 @@ MOST_ANCHORS = 1500
 
 @dataclass(frozen=True)
 class Clamps:
-    """What is held fast: whole edges of the mesh (faces in space), and single points.
+    """What holds the tissue: edges of the mesh (faces in space) that are clamped or slide, and clamped points.
+
+    A clamped edge does not move. A sliding edge moves along itself alone, without friction: skin under a probe,
+    or a table that is oiled. Any other edge is free.
 
     Parameters
     ----------
@@ -62,26 +65,41 @@ class Clamps:
         Clamped edges or faces.
     points : ndarray, shape (k, D)
         Further clamped points, mm.
+    sliding : tuple of the same names
+        Edges or faces that slide.
     """
 
     grid: Mesh
     edges: tuple[str, ...] = ("left", "right", "bottom")
     points: Floats = field(default_factory=lambda: np.empty((0, 2)))
+    sliding: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, grid: Mesh, edges: Iterable[str], points: ArrayLike | None = None) -> Clamps:
-        """Check and keep what is clamped.
+    def of(
+        cls,
+        grid: Mesh,
+        edges: Iterable[str],
+        points: ArrayLike | None = None,
+        sliding: Iterable[str] = (),
+    ) -> Clamps:
+        """Check and keep what holds the tissue.
 
         Raises
         ------
         InputError
-            If an edge has another name or a point lies outside the mesh.
+            If an edge has another name or is named twice, a point lies outside the mesh, or tissue so held could
+            still move as a whole.
         """
-        names, D = tuple(edges), len(grid.shape)
+        names, slide, D = tuple(edges), tuple(sliding), len(grid.shape)
         known = EDGES if D == 2 else tuple(SIDES)
-        for name in names:
+        for name in (*names, *slide):
             if name not in known:
                 raise InputError(f"an edge is one of {', '.join(known)}; got {name!r}")
+        for name in slide:
+            if name in names:
+                raise InputError(
+                    f"an edge is clamped, sliding or free; the {name} edge is said to be both clamped and sliding"
+                )
         held = (
             np.empty((0, D))
             if points is None or np.size(points) == 0
@@ -90,16 +108,68 @@ class Clamps:
         low, high = _extent(grid)
         if not ((held >= low) & (held <= high)).all():
             raise InputError("every clamped point must lie inside the mesh")
-        return cls(grid, names, held)
+        clamps = cls(grid, tuple(dict.fromkeys(names)), held, tuple(dict.fromkeys(slide)))
+        clamps._refuse_loose()
+        return clamps
 
     @cached_property
     def nodes(self) -> NDArray[np.intp]:
-        """Clamped mesh nodes (the nearest ones for points), ascending: what finite elements hold."""
-        index = _indices(self.grid)
+        """Clamped mesh nodes (the nearest ones for points), ascending: what finite elements hold in every direction."""
         held = [np.array([self.grid.nearest(p) for p in self.points], dtype=np.intp)]
-        for axis, side in (SIDES[edge] for edge in self.edges):
-            held.append(index.take(-side, axis=index.ndim - 1 - axis).ravel())
+        held += [self._on(edge) for edge in self.edges]
         return np.unique(np.concatenate(held))
+
+    @cached_property
+    def held(self) -> NDArray[np.bool_]:
+        """Which components of the displacement of which mesh nodes are held at zero, shape (n, D)."""
+        held = np.zeros((int(np.prod(self.grid.shape)), len(self.grid.shape)), dtype=bool)
+        held[self.nodes] = True
+        for edge in self.sliding:
+            held[self._on(edge), SIDES[edge][0]] = True
+        return held
+
+    def kind(self, edge: str) -> Literal["clamped", "sliding", "free"]:
+        """Return what an edge is."""
+        return "clamped" if edge in self.edges else "sliding" if edge in self.sliding else "free"
+
+    def _on(self, edge: str) -> NDArray[np.intp]:
+        """Mesh nodes on an edge."""
+        axis, side = SIDES[edge]
+        index = _indices(self.grid)
+        return index.take(-side, axis=index.ndim - 1 - axis).ravel()
+
+    def _refuse_loose(self) -> None:
+        """Refuse tissue that could move as a whole: some shift or turn that nothing holds."""
+        if self.edges:  # one clamped edge holds everything
+            return
+        D = len(self.grid.shape)
+        low, high = _extent(self.grid)
+        rows = []
+        for point in self.points:
+            rows += [_motions(point - low, axis) for axis in range(D)]
+        for edge in self.sliding:
+            axis, side = SIDES[edge]
+            for corner in _product([np.array([0.0, w]) for w in np.delete(high - low, axis)]):
+                rows.append(_motions(np.insert(corner, axis, side * (high - low)[axis]), axis))
+        motions = _motions(np.zeros(D), 0).size
+        size = float((high - low).max()) or 1.0
+        scaled = np.array(rows).reshape(-1, motions) / np.r_[np.ones(D), np.full(motions - D, size)]
+        if np.linalg.matrix_rank(scaled, tol=1e-6) == motions:
+            return
+        said = [f"sliding: {', '.join(self.sliding)}"] if self.sliding else []
+        said += (
+            [f"{len(self.points)} clamped point{'s'[: len(self.points) != 1]}"] if len(self.points) else []
+        )
+        loose = [
+            f"slide along {'xyz'[axis]}"
+            for axis in range(D)
+            if np.linalg.matrix_rank(np.vstack([scaled, np.eye(motions)[axis]]), tol=1e-6)
+            > np.linalg.matrix_rank(scaled, tol=1e-6)
+        ]
+        raise InputError(
+            f"what holds the tissue ({'; '.join(said) or 'no edge'}) leaves it free to {' and '.join(loose) or 'turn'}: clamp one "
+            f"edge, for example {'the bottom' if 'bottom' not in self.sliding else 'the bottom instead of letting it slide'}"
+        )
 
     def anchors(self, spacing: float) -> Floats:
         """Anchor landmarks along the clamped edges, at most ``spacing`` mm apart, shape (b, D) mm.
@@ -167,6 +237,17 @@ def join_gap(grid: Mesh, lattice: NDArray[np.intp]) -> float:
     gaps = [float(np.diff(np.unique(np.round(x, 9))).min(initial=inf)) for x in nodes.T]
     least = min(gaps)
     return 0.25 * (least if isfinite(least) else min(grid.spacing))
+
+
+def _motions(place: Floats, axis: int) -> Floats:
+    """Component along an axis of the rigid motions at a place: D shifts, then the turn (plane) or three turns (space)."""
+    turns = (
+        [np.array([-place[1], place[0]])]
+        if len(place) == 2
+        else [np.cross(unit, place) for unit in np.eye(3)]
+    )
+    motions: Floats = np.concatenate([np.eye(len(place))[axis], [turn[axis] for turn in turns]])
+    return motions
 
 
 def _extent(grid: Mesh) -> tuple[Floats, Floats]:
