@@ -46,11 +46,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--against", type=Path, help="another src folder, measured in turn")
     parser.add_argument("--runs", type=int, default=10)
+    parser.add_argument("--only", nargs="*", default=list(CASES), metavar="CASE", help="by name")
     given = parser.parse_args()
     sources = [HERE / "src", *([given.against.resolve()] if given.against else [])]
     print("| whole process | processor time, s | peak memory, MB |\n|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
-        for name, words in CASES.items():
+        for name, words in ((name, CASES[name]) for name in given.only):
             found: list[list[tuple[float, float]]] = [[] for _ in sources]
             for turn in range(given.runs + 1):  # the first fills caches and is not counted
                 for k, source in enumerate(sources):

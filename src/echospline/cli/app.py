@@ -99,17 +99,16 @@ def main() -> None:
     try:
         code = _run()
     except SystemExit as end:
-        code = end.code  # Typer's and Rich's way to end when the pipe is closed
+        code = end.code
     try:
         out.flush()
-        closed = (
-            sys.stdout is not out or _file_of(out) != file
-        )  # they put another stream or file in its place
+        # Typer and Rich end with 1 when the pipe is closed, and put another stream or file in its place.
+        closed = sys.stdout is not out or _file_of(out) != file
     except BrokenPipeError:
         closed = True
     if closed:
         os.dup2(os.open(os.devnull, os.O_WRONLY), out.fileno())
-        code = 0
+        code = 0 if code == 1 else code
     raise SystemExit(code)
 
 
