@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import zipfile
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
 from math import isfinite, prod
@@ -15,7 +16,7 @@ from typing import IO, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from echospline.atomic import give_name, part_of, writing
+from echospline.atomic import give_name, part_of, second_part, writing
 from echospline.errors import InputError
 from echospline.io.kind import head
 from echospline.io.recording import LIMIT, MIB, decoding
@@ -108,7 +109,7 @@ class DisplacementRecord:
 class DisplacementWriter:
     """Writes ``displacement.npz`` frame by frame: fields go to the disk at once, only times and poses are kept.
 
-    Memory grows by a few hundred bytes a frame. Until `close`, the fields are in ``NAME.part``, a plain ``.npy`` array whose header
+    Memory grows by a few hundred bytes a frame. Until `close`, the fields are in ``NAME.xxxxxxxx.part``, a plain ``.npy`` array whose header
     is updated after every frame, so that a killed run leaves its fields readable (``numpy.load``).
 
     Parameters
@@ -134,7 +135,8 @@ class DisplacementWriter:
         self._closed = False
         with writing(self.path):
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = part_of(self.path).open("wb")
+            self._part = part_of(self.path)
+            self._file = self._part.open("xb")
             self._file.write(self._header())
 
     def add(
@@ -192,13 +194,14 @@ class DisplacementWriter:
         small |= dict(zip(LOADS, loads.T, strict=False))
         with writing(self.path):
             self._file.close()
-            part = part_of(self.path)
-            whole = part.with_name(part.name + "2")
-            with zipfile.ZipFile(whole, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
+            with (
+                second_part(self._part) as whole,
+                zipfile.ZipFile(whole, "w", zipfile.ZIP_STORED, allowZip64=True) as archive,
+            ):
                 for name in ("displacement", *small):
                     with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                         if name == "displacement":
-                            with part.open("rb") as fields:
+                            with self._part.open("rb") as fields:
                                 while block := fields.read(_BLOCK):
                                     member.write(block)
                         else:
@@ -206,7 +209,7 @@ class DisplacementWriter:
                             np.save(buffer, np.ascontiguousarray(small[name]), allow_pickle=False)
                             member.write(buffer.getvalue())
             give_name(whole, self.path)
-            part.unlink(missing_ok=True)
+            self._part.unlink(missing_ok=True)
 
     def __enter__(self) -> Self:
         return self
@@ -218,7 +221,8 @@ class DisplacementWriter:
             self.close()
         elif not self._closed:
             self._closed = True
-            self._file.close()
+            with suppress(OSError):  # the error on its way says what is wrong
+                self._file.close()
 
     def _header(self) -> bytes:
         """Return a .npy header (format 1.0) of fixed length for the frames so far."""

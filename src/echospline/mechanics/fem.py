@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from echospline.errors import InputError
 from echospline.mechanics.fem_response import FEMResponse
 from echospline.mechanics.finite_elements import (
+    METHOD,
     Integration,
     Method,
     interpolate,
@@ -79,7 +80,7 @@ class FEMModel:
     clamped_points : array_like, shape (k, 2), optional
         Further points held fast, mm: the mesh nodes nearest to them.
     solver : {"cholmod", "superlu"}
-        See `finite_elements.factor`.
+        See `finite_elements.factor`; CHOLMOD where it is installed, else SuperLU. ``model.factored.method`` says which.
     integration : {"full", "selective"}, optional
         See `finite_elements.stiffness`; by default selective where plane strain would lock, else full.
 
@@ -98,7 +99,7 @@ class FEMModel:
         *,
         sliding: Iterable[str] = (),
         clamped_points: ArrayLike | None = None,
-        solver: Method = "cholmod",
+        solver: Method = METHOD,
         integration: Integration | None = None,
     ) -> None:
         self.tissue, self.forces = tissue or Tissue(), forces or NeedleForces()

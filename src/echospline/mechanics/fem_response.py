@@ -12,6 +12,7 @@ from scipy import sparse
 from echospline.errors import InputError
 from echospline.mechanics.cut_cells import elements_of
 from echospline.mechanics.finite_elements import (
+    METHOD,
     Integration,
     Method,
     factor,
@@ -57,7 +58,7 @@ class FEMResponse:
         clamps: Clamps,
         tissue: Tissue,
         *,
-        solver: Method = "cholmod",
+        solver: Method = METHOD,
         integration: Integration | None = None,
     ) -> None:
         self._grid, self.clamps, self.tissue = grid, clamps, tissue

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
+from importlib.util import find_spec
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -18,12 +19,14 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 from skfem import Basis, BilinearForm, ElementQuad1, ElementVector, MeshQuad
 
-from echospline.errors import InputError, SolverError
+from echospline.errors import InputError, MissingExtraError, SolverError
 from echospline.scene import Floats, RegularGrid, as_points
 
 Plane = Literal["stress", "strain"]
 Integration = Literal["full", "selective"]
 Method = Literal["cholmod", "superlu"]
+METHOD: Method = "cholmod" if find_spec("kvxopt") else "superlu"
+"""Default factorisation: CHOLMOD where the extra is installed; results and commands say which it was."""
 
 MPA = 1e-3
 """N/mm^2 per kPa."""
@@ -228,7 +231,7 @@ class Compliance:
         return (self.columns @ loads[self.nodes].reshape(-1)).reshape(-1, 2)
 
 
-def factor(K: Any, held: ArrayLike, method: Method = "cholmod") -> FactoredStiffness:
+def factor(K: Any, held: ArrayLike, method: Method = METHOD) -> FactoredStiffness:
     """Factor the stiffness matrix with some nodes, or some of their components, held.
 
     Parameters
@@ -239,12 +242,15 @@ def factor(K: Any, held: ArrayLike, method: Method = "cholmod") -> FactoredStiff
         Nodes held in both directions, or which components (lateral, depth) of which nodes are held
         (`Clamps.held`: an edge that slides holds one). No shift and no turn of the tissue as a whole may be left.
     method : {"cholmod", "superlu"}
-        "cholmod" (kvxopt) is the faster; "superlu" needs nothing but SciPy. Never swapped silently.
+        "cholmod" (kvxopt, an extra) is the faster on large meshes; "superlu" needs nothing but SciPy. The one named is used;
+        by default CHOLMOD where it is installed.
 
     Raises
     ------
     InputError
-        If what is held leaves a shift free, or the method is unknown or not installed.
+        If what is held leaves a shift free, or the method is unknown.
+    MissingExtraError
+        If it is "cholmod" and kvxopt is not installed.
     SolverError
         If the matrix is not positive definite.
     """
@@ -394,8 +400,8 @@ def _cholmod(A: Any) -> Callable[[Floats], Floats]:
         kvxopt: Any = import_module("kvxopt")
         cholmod: Any = import_module("kvxopt.cholmod")
     except ImportError as missing:
-        raise InputError(
-            "method 'cholmod' needs the package kvxopt; install it or use 'superlu'"
+        raise MissingExtraError(
+            "kvxopt", "cholmod", "factoring by CHOLMOD (superlu needs nothing)"
         ) from missing
     lower = sparse.tril(A).tocoo()
     Ak = kvxopt.spmatrix(lower.data, lower.row.astype(int), lower.col.astype(int), A.shape)

@@ -8,7 +8,7 @@ from math import exp, isfinite
 import numpy as np
 
 from echospline.errors import InputError
-from echospline.scene import Floats, NeedlePose
+from echospline.scene import Floats, NeedlePose, is_number
 
 
 @dataclass(frozen=True)
@@ -181,5 +181,5 @@ def travelled(before: NeedlePose | None, after: NeedlePose) -> float:
 
 def check_step(dt: float) -> None:
     """Refuse a time step that is negative or not finite."""
-    if not (isfinite(dt) and dt >= 0):
-        raise InputError(f"dt must be zero or a positive number in s; got {dt}")
+    if not (is_number(dt) and dt >= 0):
+        raise InputError(f"dt must be zero or a positive number in s; got {dt!r}")

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import partial
-from math import isfinite
 from typing import Literal, get_args
 
 import numpy as np
@@ -22,7 +21,7 @@ from echospline.mechanics.native import NativeState, NativeStep, Precision
 from echospline.mechanics.parameters import TPSParameters
 from echospline.mechanics.reference import Reference, TPSState
 from echospline.mechanics.spline import Spline, condition
-from echospline.scene import Floats, NeedlePose, RegularGrid
+from echospline.scene import Floats, NeedlePose, RegularGrid, is_number
 
 Solver = Literal["response", "refit"]
 
@@ -180,8 +179,8 @@ class TPSModel:
         InputError
             If dt is negative or not finite.
         """
-        if not (isfinite(dt) and dt >= 0):
-            raise InputError(f"dt must be zero or a positive number of seconds; got {dt}")
+        if not (is_number(dt) and dt >= 0):
+            raise InputError(f"dt must be zero or a positive number of seconds; got {dt!r}")
         if isinstance(state, NativeState):
             return self._native().advance(state, pose, dt)
         if self.native is not None:

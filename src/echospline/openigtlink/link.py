@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from echospline.errors import InputError, ProtocolError
+from echospline.openigtlink.header import PORT
 from echospline.openigtlink.message import READABLE, Message, Request
 from echospline.openigtlink.peer import Key, Outgoing, Patience, Peer
 from echospline.openigtlink.text import NOT_FOUND, Capability, Status
@@ -16,8 +17,6 @@ from echospline.openigtlink.tools import StartTracking
 
 log = logging.getLogger("echospline.openigtlink")
 
-PORT = 18944
-"""The port of OpenIGTLink."""
 QUESTIONS = (
     "GET_STATUS",
     "GET_CAPABIL",

@@ -7,7 +7,8 @@ from math import isfinite
 
 from echospline.errors import InputError
 from echospline.live import LiveEngine
-from echospline.openigtlink.link import PORT, LinkLimits
+from echospline.openigtlink.header import PORT
+from echospline.openigtlink.link import LinkLimits
 from echospline.openigtlink.outgoing import Looks
 from echospline.openigtlink.tools import STREAMED_ON_REQUEST
 from echospline.scene import Insertion, Reach, UltrasoundImage

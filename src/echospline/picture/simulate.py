@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from math import ceil, isfinite
+from math import ceil
 from time import perf_counter
 from typing import Literal
 
@@ -14,7 +14,7 @@ from echospline.picture.deformation import Folds
 from echospline.picture.drawing import Drawing, ImageFormer
 from echospline.picture.native import Border, Inverse
 from echospline.picture.needle_echo import NeedleEcho
-from echospline.scene import Floats, Insertion, NeedlePose, UltrasoundImage
+from echospline.scene import Floats, Insertion, NeedlePose, UltrasoundImage, is_number
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def frame_count(insertion: Insertion, fps: float) -> int:
     InputError
         If fps is not positive.
     """
-    if not (isfinite(fps) and fps > 0):
+    if not (is_number(fps) and fps > 0):
         raise InputError(f"fps must be a positive number of frames per second; got {fps}")
     return int(insertion.duration * fps + 1e-9) + 1
 
@@ -119,7 +119,7 @@ def simulate(
         If the picture folds and ``folding="refuse"``.
     """
     count = frame_count(insertion, fps)
-    if not (isfinite(longest_step) and longest_step > 0):
+    if not (is_number(longest_step) and longest_step > 0):
         raise InputError(f"longest_step must be a positive number of seconds; got {longest_step}")
     steps = max(1, ceil(1.0 / fps / longest_step - 1e-9))
     start = float(insertion.times[0])

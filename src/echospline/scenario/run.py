@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from echospline.atomic import give_name, part_of
-from echospline.errors import InputError
+from echospline.atomic import appearing, writing
 from echospline.io import DisplacementWriter, open_writer
 from echospline.io.sequence import SequenceWriter
 from echospline.mechanics import describe_core
@@ -69,13 +68,21 @@ def _forces(load: NeedleLoad | None) -> dict[str, float]:
 
 
 def _sink(
-    name: str, stack: ExitStack, out: Path, image: UltrasoundImage, fps: float
+    name: str,
+    stack: ExitStack,
+    out: Path,
+    image: UltrasoundImage,
+    fps: float,
+    window: tuple[float, float] | None,
 ) -> Callable[[Frame], None]:
     """Open the writer of one format."""
     if name in ("igs.mha", "seq.nrrd"):  # for PLUS and 3D Slicer: pictures with the needle's transforms
         recording = stack.enter_context(SequenceWriter(out / SUFFIX[name], image.grid))
         return lambda frame: recording.add(frame.image.pixels, frame.time, frame.pose)
-    cine = stack.enter_context(open_writer(out / SUFFIX[name], image.grid, fps))
+    narrow = name != "mha" and (window is not None)
+    cine = stack.enter_context(
+        open_writer(out / SUFFIX[name], image.grid, fps, window=window if narrow else None)
+    )
     return lambda frame: cine.add(frame.image.pixels, frame.time)
 
 
@@ -88,6 +95,7 @@ def run(
     *,
     progress: Callable[[int, int], None] | None = None,
     form_image: ImageFormer | None = None,
+    doubts: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Simulate a scenario and write its results.
 
@@ -107,6 +115,8 @@ def run(
         Called with (frames done, number of frames).
     form_image : callable, optional
         See `simulate`.
+    doubts : sequence of str
+        What was said before the run (see `prepared`); kept in the report.
 
     Returns
     -------
@@ -119,10 +129,8 @@ def run(
         If the folder cannot be written.
     """
     began = perf_counter()
-    try:
+    with writing(out):
         out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot make the folder {out} for the results: {error.strerror}") from error
     insertion, output = scenario.insertion(), scenario.output
     count = frame_count(insertion, output.fps)
     tally, files = _Tally(), []
@@ -133,7 +141,7 @@ def run(
         sinks = []
         for name in dict.fromkeys(output.formats):
             files.append(SUFFIX[name])
-            sinks.append(_sink(name, stack, out, image, output.fps))
+            sinks.append(_sink(name, stack, out, image, output.fps, output.window))
         record = None
         if output.displacement:
             files.append("displacement.npz")
@@ -193,6 +201,7 @@ def run(
         **({"largest_forces": tally.forces} if tally.forces else {}),
         "inverse_map_residual_px": tally.residual,
         "folded_frames": tally.folded,
+        "doubts": list(doubts),
         "milliseconds_per_frame": {
             name: {
                 "median": float(np.median(ms)),
@@ -207,9 +216,8 @@ def run(
         "core": describe_core(),
         "parameters": scenario.model_dump(mode="json"),
     }
-    part = part_of(out / "run.json")
-    part.write_text(json.dumps(report, indent=2), encoding="utf-8")
-    give_name(part, out / "run.json")
+    with appearing(out / "run.json") as part:
+        part.write_text(json.dumps(report, indent=2), encoding="utf-8")
     return report
 
 

@@ -12,16 +12,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import tomlkit
 from pydantic import BaseModel, Field, ValidationError
 
-from echospline.atomic import give_name, part_of
+from echospline.atomic import appearing
 from echospline.errors import InputError
-from echospline.io import read_image
 from echospline.picture import NeedleEcho
 from echospline.scenario.messages import describe as _describe
 from echospline.scenario.messages import sentence, shown
 from echospline.scenario.phantom_section import PhantomSection, ProbeSection
+from echospline.scenario.scale import PHANTOM, size_doubts
 from echospline.scenario.sections import (
     VISCOUS,
     ExerciseSection,
@@ -47,7 +46,6 @@ from echospline.scene import (
     UltrasoundImage,
 )
 
-PHANTOM = "sample:phantom"
 LARGEST_FILE = 1_000_000
 """Bytes; a scenario is a page of text."""
 
@@ -60,14 +58,14 @@ class Scenario(Section):
 
     format: Literal[1] = Field(1, description="version of this file's layout")
     title: str = Field("", description="one line for reports")
-    image: ImageSection = ImageSection()
-    tissue: TissueSection = TissueSection()
-    mesh: MeshSection = MeshSection()
+    image: ImageSection = Field(default_factory=ImageSection)
+    tissue: TissueSection = Field(default_factory=TissueSection)
+    mesh: MeshSection = Field(default_factory=MeshSection)
     needle: NeedleSection = Field(default_factory=NeedleSection)
-    model: ModelSection = ModelSection()
-    output: OutputSection = OutputSection()
-    probe: ProbeSection = ProbeSection()
-    phantom: PhantomSection = PhantomSection()
+    model: ModelSection = Field(default_factory=ModelSection)
+    output: OutputSection = Field(default_factory=OutputSection)
+    probe: ProbeSection = Field(default_factory=ProbeSection)
+    phantom: PhantomSection = Field(default_factory=PhantomSection)
     exercise: list[ExerciseSection] = Field(default=[], description="what can be trained live")
 
     def with_values(self, values: Mapping[str, Any], origin: str = "scenario") -> Scenario:
@@ -94,12 +92,22 @@ class Scenario(Section):
         return validated(tree, origin)
 
     def read_image(self, folder: Path) -> UltrasoundImage:
-        """Read the image; a relative path starts at ``folder``; sample:phantom is [phantom] at rest."""
+        """Read the image; a relative path starts at ``folder``; sample:phantom is [phantom] at rest.
+
+        Raises
+        ------
+        InputError
+            If it cannot be read, or has a size that no ultrasound picture has.
+        """
         section = self.image
         if section.file == PHANTOM:
             return self.phantom.still(self.probe.probe())
+        from echospline.io import read_image  # noqa: PLC0415  (a wrong key is said before readers are loaded)
+
         name = section.file if section.file.startswith("sample:") else str(folder / section.file)
-        return read_image(name, spacing=section.spacing, frame=section.frame, region=section.region)
+        image = read_image(name, spacing=section.spacing, frame=section.frame, region=section.region)
+        size_doubts(image.grid)  # refuses what no scene can be, before anything is made of it
+        return image
 
     def grid(self, image: UltrasoundImage) -> RegularGrid:
         """Lay the mesh over the image."""
@@ -144,6 +152,8 @@ class Scenario(Section):
 
     def save(self, path: Path, folder: Path) -> None:
         """Write the scenario with a comment for every key; relative paths in ``folder`` stay valid from ``path``."""
+        import tomlkit  # noqa: PLC0415  (only runs are written; many scenarios are only read)
+
         document = tomlkit.document()
         document.add(
             tomlkit.comment("echospline scenario: run it with  echospline simulate THIS_FILE --out DIR")
@@ -152,10 +162,9 @@ class Scenario(Section):
         if not self.image.file.startswith("sample:"):
             image = os.path.relpath((folder / self.image.file).resolve(), path.parent.resolve())
             moved = self.model_copy(update={"image": self.image.model_copy(update={"file": image})})
-        _write_section(document, moved)
-        part = part_of(path)
-        part.write_text(tomlkit.dumps(document), encoding="utf-8")
-        give_name(part, path)
+        _write_section(tomlkit, document, moved)
+        with appearing(path) as part:
+            part.write_text(tomlkit.dumps(document), encoding="utf-8")
 
 
 def load(path: str | Path) -> Scenario:
@@ -235,6 +244,8 @@ def _shape(region: RegionSection, folder: Path, mesh: RegularGrid, key: str) -> 
         return Polygon(tuple(region.polygon))
     if region.labels is None:
         raise InputError(f"{key} says nothing of where it is")
+    from echospline.io import read_image  # noqa: PLC0415  (as above)
+
     path = folder / region.labels.file
     labels = read_image(str(path), spacing=(1.0, 1.0)).pixels
     if labels.ndim != 2 or not np.issubdtype(labels.dtype, np.integer):
@@ -243,7 +254,7 @@ def _shape(region: RegionSection, folder: Path, mesh: RegularGrid, key: str) -> 
     return Label(labels.astype(np.int64), RegularGrid.covering(mesh, shape), region.labels.value)
 
 
-def _write_section(table: Any, section: BaseModel) -> None:
+def _write_section(toml: Any, table: Any, section: BaseModel) -> None:
     """Add every key of a section with its description as a comment; sections inside come after plain keys."""
     inner: list[tuple[str, Any]] = []
     for name, field in type(section).model_fields.items():
@@ -255,21 +266,21 @@ def _write_section(table: Any, section: BaseModel) -> None:
         ):
             inner.append((name, value))
         else:
-            item = tomlkit.item(_as_toml(value))
+            item = toml.item(_as_toml(value))
             if field.description:
                 item.comment(field.description)
             table.add(name, item)
     for name, value in inner:
         if isinstance(value, BaseModel):
-            sub = tomlkit.table()
-            _write_section(sub, value)
-            table.add(tomlkit.nl())
+            sub = toml.table()
+            _write_section(toml, sub, value)
+            table.add(toml.nl())
             table.add(name, sub)
         else:
-            rows = tomlkit.aot()
+            rows = toml.aot()
             for row in value:
-                sub = tomlkit.table()
-                _write_section(sub, row)
+                sub = toml.table()
+                _write_section(toml, sub, row)
                 rows.append(sub)
             table.add(name, rows)
 

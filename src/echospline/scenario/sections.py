@@ -46,7 +46,7 @@ Point = tuple[Millimetres, Millimetres]
 class Section(BaseModel):
     """A table of the file: unknown keys are refused, infinite and NaN numbers too."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
 
 
 class ImageSection(Section):
@@ -110,7 +110,9 @@ class MeshSection(Section):
     """The mesh over the image and its clamped edges."""
 
     nodes: tuple[Annotated[int, Field(ge=2, le=4096)], Annotated[int, Field(ge=2, le=4096)]] = Field(
-        (40, 30), description="nodes along x and y, corner to corner over the image"
+        (40, 30),
+        description="nodes along x and y, corner to corner over the image",
+        json_schema_extra={"between": "x"},  # as the command line takes it: 40x30
     )
     clamped: list[Literal["top", "bottom", "left", "right"]] = Field(
         ["left", "right", "bottom"], description="edges held fast; top is the probe's face"
@@ -328,10 +330,10 @@ class ModelSection(Section):
     """The tissue model."""
 
     kind: Literal["tps", "elastic", "green", "fem"] = Field("tps", description="tps, elastic, green or fem")
-    landmarks: LandmarkSection = LandmarkSection()
-    elastic: ElasticSection = ElasticSection()
-    green: GreenSection = GreenSection()
-    forces: ForceSection = ForceSection()
+    landmarks: LandmarkSection = Field(default_factory=LandmarkSection)
+    elastic: ElasticSection = Field(default_factory=ElasticSection)
+    green: GreenSection = Field(default_factory=GreenSection)
+    forces: ForceSection = Field(default_factory=ForceSection)
 
 
 class OutputSection(Section):
@@ -347,6 +349,10 @@ class OutputSection(Section):
     needle: bool = Field(True, description="draw the needle's echo")
     border: Annotated[float, Field(ge=0)] | Literal["transparent"] = Field(
         0.0, description="value where no tissue comes to lie"
+    )
+    window: tuple[float, float] | None = Field(
+        None,
+        description="pixel values shown as black and white where a format holds 8 bits; chosen where needed and not given",
     )
     folding: Literal["flag", "refuse"] = Field("flag", description="what happens when the picture folds")
     inverse: Literal["auto", "exact"] = Field(

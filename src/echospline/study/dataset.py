@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from echospline.atomic import give_name, part_of, writing
+from echospline.atomic import appearing, writing
 from echospline.errors import InputError, MissingExtraError
 from echospline.laboratory import phantom_pictures
 from echospline.picture import OUTER_DIAMETER, simulate
@@ -234,10 +234,8 @@ def needle_mask(
 def write_summary(path: Path, summary: Mapping[str, Any]) -> None:
     """Write ``dataset.json`` beside the arrays."""
     file = path / "dataset.json"
-    with writing(file):
-        part = part_of(file)
+    with appearing(file) as part:
         part.write_text(json.dumps(summary, indent=1), encoding="utf-8")
-        give_name(part, file)
 
 
 def _zarr() -> Any:

@@ -12,16 +12,18 @@ import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-from echospline.atomic import give_name, part_of, writing
-from echospline.errors import EchosplineError
+from echospline.atomic import appearing
+from echospline.errors import EchosplineError, MissingExtraError
 from echospline.io import read_image
 from echospline.mechanics import FEMModel, GreenModel, ThinPlate
 from echospline.picture import Deformation, warp
+from echospline.scenario import size_doubts
 from echospline.scene import RegularGrid, UltrasoundImage
 from echospline.study.accuracy import (
     CLAMPED,
@@ -137,7 +139,14 @@ def study(
     -------
     dict
         ``accuracy``, ``scenes``, ``linearity``, ``speed``, ``savings``, ``identification`` and ``claims`` as written.
+
+    Raises
+    ------
+    MissingExtraError
+        If kvxopt, which the times are compared with, is not installed.
     """
+    if find_spec("kvxopt") is None:
+        raise MissingExtraError("kvxopt", "cholmod", "the study's comparison of times with CHOLMOD")
     say = report or (lambda _: None)
     tasks = _tasks(extent, seed)
     where = {"workers": workers, "scheduler": scheduler}
@@ -189,7 +198,9 @@ def figure_2(out: Path, extent: Extent, seed: int, image: str) -> None:
         "TPS": observe(tps, times, poses).displacement[-1],
         "Green": observe(green, times, poses).displacement[-1],
     }
-    picture = _fitted_to(read_image(image), grid)
+    found = read_image(image)
+    size_doubts(found.grid, "the image's spacing")  # refuses what no picture can be
+    picture = _fitted_to(found, grid)
     images = {"at rest": picture} | {
         f"deformed by {name}": warp(picture, Deformation(grid, u))
         for name, u in fields.items()
@@ -279,24 +290,18 @@ def _fitted_to(image: UltrasoundImage, grid: RegularGrid) -> UltrasoundImage:
 
 
 def _write(path: Path, text: str) -> None:
-    with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part = part_of(path)
+    with appearing(path) as part:
         part.write_text(text, encoding="utf-8")
-        give_name(part, path)
 
 
 def _write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     columns = list(dict.fromkeys(key for row in rows for key in row))
-    with writing(path):
-        part = part_of(path)
-        with part.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, columns)
-            writer.writeheader()
-            writer.writerows(
-                {k: json.dumps(v) if isinstance(v, dict) else v for k, v in row.items()} for row in rows
-            )
-        give_name(part, path)
+    with appearing(path) as part, part.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, columns)
+        writer.writeheader()
+        writer.writerows(
+            {k: json.dumps(v) if isinstance(v, dict) else v for k, v in row.items()} for row in rows
+        )
 
 
 _ACCURACY = {
