@@ -42,6 +42,10 @@ def _words(text: str) -> list[str]:
     return [part.strip() for part in text.split(",") if part.strip()]
 
 
+def _edges(text: str) -> list[str]:
+    return [] if text.strip() == "none" else _words(text)
+
+
 def _border(text: str) -> float | str:
     return text if text == "transparent" else float(text)
 
@@ -69,6 +73,7 @@ OPTIONS = (
     Option("--region", "image.region", "L,T,R,B", _integers, "Image"),
     Option("--mesh", "mesh.nodes", "NXxNY", _nodes, "Mesh"),
     Option("--clamped", "mesh.clamped", "EDGE,...", _words, "Mesh"),
+    Option("--sliding", "mesh.sliding", "EDGE,...|none", _edges, "Mesh"),
     Option("--entry", "needle.entry", "X,Y", _numbers),
     Option("--angle", "needle.angle", "DEG"),
     Option("--depth", "needle.depth", "MM"),

@@ -117,7 +117,7 @@ def yielding(f: Floats, clearance: Floats) -> Floats:
         Distance to what is clamped, mm.
     """
     reach = 5.0 * np.abs(f)
-    near = np.minimum(1.0, np.divide(clearance, reach, out=np.ones_like(f), where=reach > 0))
+    near = np.divide(clearance, reach, out=np.ones_like(f), where=clearance < reach)
     step = near * near * (3.0 - 2.0 * near)
     faded: Floats = f * step * step
     return faded

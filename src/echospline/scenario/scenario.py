@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from echospline.atomic import appearing
 from echospline.errors import InputError
@@ -46,6 +46,13 @@ from echospline.scene import (
     UltrasoundImage,
 )
 
+FORMAT_1 = {
+    "mesh.sliding": [],
+    "model.kind": "tps",
+    "model.landmarks.loading": "follow",
+    "model.forces.law": "viscous",
+}
+"""What a file of format 1 means where it does not say."""
 LARGEST_FILE = 1_000_000
 """Bytes; a scenario is a page of text."""
 
@@ -56,7 +63,7 @@ class Scenario(Section):
     Read one with `load`, change it with `with_values`, write it with `save`.
     """
 
-    format: Literal[1] = Field(1, description="version of this file's layout")
+    format: Literal[2] = Field(2, description="version of this file's meaning; 1 is read as it was meant")
     title: str = Field("", description="one line for reports")
     image: ImageSection = Field(default_factory=ImageSection)
     tissue: TissueSection = Field(default_factory=TissueSection)
@@ -67,6 +74,24 @@ class Scenario(Section):
     probe: ProbeSection = Field(default_factory=ProbeSection)
     phantom: PhantomSection = Field(default_factory=PhantomSection)
     exercise: list[ExerciseSection] = Field(default=[], description="what can be trained live")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_format_1(cls, given: Any) -> Any:
+        """Fill in what a file of format 1 meant where it said nothing: a free top, landmarks that relax, viscous friction, the spline."""
+        if not isinstance(given, Mapping) or given.get("format") != 1:
+            return given
+        tree = {**given, "format": 2}
+        for key, meant in FORMAT_1.items():
+            *tables, last = key.split(".")
+            table = tree
+            for name in tables:
+                inner = table.get(name, {})
+                if not isinstance(inner, Mapping):
+                    return tree  # not a table: the fault is said by the fields
+                table[name] = table = dict(inner)
+            table.setdefault(last, meant)
+        return tree
 
     def with_values(self, values: Mapping[str, Any], origin: str = "scenario") -> Scenario:
         """Return a copy with some keys changed, ``{"needle.depth": 20}``, validated.

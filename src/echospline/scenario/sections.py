@@ -239,7 +239,10 @@ class LandmarkSection(Section):
     contact_spacing: Millimetres = Field(
         1.25, ge=0, le=50, description="between contacts, mm; 0 takes every node"
     )
-    anchor_spacing: Millimetres = Field(1.5, gt=0, le=50, description="between anchors on clamped edges, mm")
+    anchor_spacing: Annotated[Millimetres, Field(gt=0, le=50)] | None = Field(
+        None,
+        description="between anchors on held edges, mm; 1.5 where not given, 1 for elastic beside an edge that slides",
+    )
 
 
 class ElasticSection(Section):
