@@ -181,10 +181,16 @@ def test_defaults_are_those_of_the_model():
 
 
 def test_a_file_of_format_1_means_what_it_meant(tmp_path):
-    old = validated({"format": 1, "mesh": {"nodes": [9, 9]}, "model": {"landmarks": {"sigma": 0.5}}}, "old.toml")
+    old = validated(
+        {"format": 1, "mesh": {"nodes": [9, 9]}, "model": {"landmarks": {"sigma": 0.5}}}, "old.toml"
+    )
     assert old.format == 2
     assert (old.mesh.sliding, old.model.kind) == ([], "tps")
-    assert (old.model.landmarks.loading, old.model.landmarks.sigma, old.model.forces.law) == ("follow", 0.5, "viscous")
+    assert (old.model.landmarks.loading, old.model.landmarks.sigma, old.model.forces.law) == (
+        "follow",
+        0.5,
+        "viscous",
+    )
     chosen = validated({"format": 1, "model": {"kind": "fem", "forces": {"law": "stick-slip"}}}, "old.toml")
     assert (chosen.model.kind, chosen.model.forces.law) == ("fem", "stick-slip")
     old.save(tmp_path / "again.toml", tmp_path)

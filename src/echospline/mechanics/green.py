@@ -115,9 +115,7 @@ class GreenModel:
             raise InputError(f"station_spacing must be a positive number in mm; got {station_spacing}")
         self.station_spacing = station_spacing
         clamps = Clamps.of(grid, clamped, clamped_points, sliding)
-        self.response: GreenResponse = green_response(
-            grid, clamps, self.tissue, radius=radius, method=method
-        )
+        self.response: GreenResponse = green_response(grid, clamps, self.tissue, radius=radius, method=method)
         self.needle = (
             ForceModel(self.response, self.forces) if isinstance(self.forces, NeedleForces) else None
         )
@@ -154,7 +152,9 @@ class GreenModel:
         check_step(dt)
         if self.needle is not None and isinstance(state, ForceState):
             after = self.needle.advance(state, pose, dt)
-            if after.load.tip > 0 and len(after.track) != len(state.track):  # the tip has come to another place
+            if after.load.tip > 0 and len(after.track) != len(
+                state.track
+            ):  # the tip has come to another place
                 self._warn(np.array([pose.tip]), after.load.tip * np.array([pose.axis]))
             return after
         law = self.forces

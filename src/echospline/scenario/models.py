@@ -70,7 +70,9 @@ def build_model(
         green = scenario.model.green.model_dump()
         return GreenModel(grid, clamped, tissue, forces, sliding=sliding, clamped_points=points, **green)
     landmarks = scenario.model.landmarks.model_dump(exclude_none=True)
-    if kind == "elastic" and sliding:  # further apart, a fifth of a displacement passes through a sliding edge between anchors
+    if (
+        kind == "elastic" and sliding
+    ):  # further apart, a fifth of a displacement passes through a sliding edge between anchors
         landmarks.setdefault("anchor_spacing", 1.0)
     parameters = TPSParameters(**landmarks)
     kernel: Kernel = ThinPlate()

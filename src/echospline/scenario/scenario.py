@@ -108,6 +108,13 @@ class Scenario(Section):
             for name in tables:
                 table = table[name]
             table[last] = value
+        mesh = tree["mesh"]
+        if (
+            "mesh.clamped" in values
+            and "mesh.sliding" not in values
+            and isinstance(mesh["clamped"], list | tuple)
+        ):
+            mesh["sliding"] = [edge for edge in mesh["sliding"] if edge not in mesh["clamped"]]  # clamped now
         old = [key for key in values if key.startswith("model.forces.") and key.split(".")[-1] in VISCOUS]
         if old and tree["model"]["forces"]["law"] == "stick-slip":
             raise InputError(
