@@ -332,7 +332,9 @@ VISCOUS = frozenset({"friction", "alpha3", "ramp"})
 class ModelSection(Section):
     """The tissue model."""
 
-    kind: Literal["tps", "elastic", "green", "fem"] = Field("tps", description="tps, elastic, green or fem")
+    kind: Literal["tps", "elastic", "green", "fem"] = Field(
+        "green", description="green, tps (paper), elastic or fem"
+    )
     landmarks: LandmarkSection = Field(default_factory=LandmarkSection)
     elastic: ElasticSection = Field(default_factory=ElasticSection)
     green: GreenSection = Field(default_factory=GreenSection)
