@@ -11,8 +11,8 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from echospline.mechanics import AnchoredKernel, Clamps, Elastic, FEMModel, ThinPlate
-from echospline.mechanics.half_plane import GreensFunction
-from echospline.scene import distance, field_error
+from echospline.mechanics.green_response import green_response
+from echospline.scene import Tissue, distance, field_error
 from echospline.study.accuracy import CLAMPED, FITTED, HELD_OUT, Case, observe, oracle
 from echospline.study.identify import _least
 
@@ -68,29 +68,23 @@ class Displaced:
 
 
 class Green:
-    """Point forces in clamped elastic tissue, with a free surface or without."""
+    """Point forces in clamped elastic tissue under a free or a sliding top."""
 
-    def __init__(self, surface, radius):
-        anchors = Clamps.of(GRID, CLAMPED).anchors(1.5)
-        self.green = GreensFunction(anchors, 10.0, 0.45, 40.0, "stress", radius, 1.5 / (2 * np.pi), surface)
-        self.projector = self.green.projector(NODES)
+    def __init__(self, sliding, radius):
+        self.response = green_response(
+            GRID, Clamps.of(GRID, CLAMPED, None, sliding), Tissue(10.0), radius=radius
+        )
+
+    def fields(self, pose, force):
+        place = np.array([pose.tip])
+        return self.response.answer(place, np.reshape(force, (1, 2, 1)), place)
 
     def loaded(self, pose):
-        return (
-            (self.green.columns(NODES, [pose.tip], self.projector) @ np.array(pose.axis))
-            .reshape(2, -1, 1)
-            .transpose(1, 0, 2)
-        )
+        return self.fields(pose, pose.axis)[0]
 
     def displaced(self, pose):
-        axis = np.array(pose.axis)
-        own = self.green.columns([pose.tip], [pose.tip])
-        weights = np.linalg.solve(own, axis)
-        return (
-            (self.green.columns(NODES, [pose.tip], self.projector) @ weights)
-            .reshape(2, -1, 1)
-            .transpose(1, 0, 2)
-        )
+        own = np.column_stack([self.fields(pose, unit)[1][0, :, 0] for unit in np.eye(2)])
+        return self.fields(pose, np.linalg.solve(own, np.array(pose.axis)))[0]
 
 
 def paper(length):
@@ -157,9 +151,9 @@ def main():
             f"elastic, radius {radius} mm: law, delta 2.1, length 5",
             lambda p, s=spline: s.fields(p, 2.1, paper(5.0)),
         )
-    for label, surface in (("no free surface", None), ("free surface", 0.0)):
+    for label, sliding in (("sliding top", ("top",)), ("free top", ())):
         for radius in (0.4, 1.0):
-            green = Green(surface, radius)
+            green = Green(sliding, radius)
             report(f"Green's function, {label}, radius {radius} mm: tip displaced", green.displaced)
             report(f"Green's function, {label}, radius {radius} mm: tip force", green.loaded)
 

@@ -84,12 +84,15 @@ def scene(**changes):
 
 
 @contextmanager
-def running(folder, *, settings=None, opener=None, **changes):
-    """Serve a scene on loopback in a thread; yields (address without slash, sessions, app)."""
+def running(folder, *, settings=None, opener=None, over=None, patience=20, **changes):
+    """Serve a scene on loopback in a thread; yields (address without slash, sessions, app).
+
+    `over` stops it earlier than at the end of the context; it then ends within `patience` seconds.
+    """
     settings = settings or Settings(port=0)
     sessions = Sessions(folder / "sessions.sqlite")
     app = build_app(scene(**changes), sessions, settings, opener)
-    address, up, over = [], threading.Event(), threading.Event()
+    address, up, over = [], threading.Event(), over or threading.Event()
 
     def ready(where):
         address.append(where)
@@ -102,5 +105,5 @@ def running(folder, *, settings=None, opener=None, **changes):
         yield address[0].split("/#")[0].rstrip("/"), sessions, app
     finally:
         over.set()
-        thread.join(20)
+        thread.join(patience)
         assert not thread.is_alive()

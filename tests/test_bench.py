@@ -38,7 +38,7 @@ def test_the_table_says_what_fits_and_at_which_level(monkeypatch):
         Row("step at 1 kHz", 1200, 51, 0.02, 0.05, 0.004, 5.0, "AVX2"),
         Row("frame", 4524, 51, 20.0, 30.0, 0.01, 2000.0, "AVX2"),
     ]
-    monkeypatch.setattr("echospline.cli.bench.benchmark", lambda _: rows)
+    monkeypatch.setattr("echospline.study.benchmark", lambda _: rows)
     lines = CliRunner().invoke(app, ["bench"]).stdout.splitlines()
     step = next(line.split() for line in lines if line.startswith("step at"))
     frame = next(line.split() for line in lines if line.startswith("frame "))

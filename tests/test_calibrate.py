@@ -59,6 +59,15 @@ def test_identified_forces_are_those_of_the_recording(recorded, tmp_path):
     }  # fmt: skip
 
 
+def test_a_material_that_is_not_linear_is_refused(recorded, tmp_path):
+    scene = (
+        (recorded / "scenario.toml").read_text().replace('material = "linear"', 'material = "neo-hookean"')
+    )
+    (tmp_path / "scene.toml").write_text(scene)
+    with pytest.raises(InputError, match=r"set tissue\.material = 'linear'"):
+        calibrate(field=str(recorded), out=str(tmp_path), scenario=str(tmp_path / "scene.toml"))
+
+
 def test_simulate_runs_what_was_identified_and_shows_the_recorded_motion(recorded, tmp_path):
     """The whole circle on the command line: record, identify another model, simulate it, compare."""
     runner = CliRunner()

@@ -217,7 +217,7 @@ def test_javascript_calls_functions_of_the_header_alone():
     assert names <= set(declared())
     called_by_name = {
         f"echospline_{what}_{verb}"
-        for what in ("scene", "tissue", "picture")
+        for what in ("scene", "tissue", "picture", "forced")
         for verb in ("create", "message")
     }
     called_by_name |= {"echospline_scene_destroy", "echospline_tissue_destroy"}

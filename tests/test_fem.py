@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from echospline.errors import InputError
-from echospline.mechanics import FEMModel, NeedleForces
+from echospline.mechanics import FEMModel, ViscousForces
 from echospline.mechanics.finite_elements import factor, point_loads, stiffness
 from echospline.scene import Circle, Insertion, NeedlePose, Region, RegularGrid, Tissue
 
 GRID = RegularGrid((31, 25), (40 / 30, 30 / 24))
-PRINTED = NeedleForces(ramp=0.0)
+PRINTED = ViscousForces(ramp=0.0)
 PUSH = NeedlePose((8.0, 0.0), (22.0, 14.0), 5.0)
 
 
@@ -24,7 +24,7 @@ def run(model, insertion, dt):
 
 
 def test_printed_law_is_one_solve_with_the_force_at_the_tip():
-    model = FEMModel(GRID, forces=NeedleForces(0.4, 0.0, ramp=0.0))
+    model = FEMModel(GRID, forces=ViscousForces(0.4, 0.0, ramp=0.0))
     state = model.advance(model.rest(), PUSH, 0.1)
     K = stiffness(GRID, 10.0, 0.45, 40.0)
     axis = np.array([1.0, 1.0]) / np.sqrt(2)
@@ -35,13 +35,13 @@ def test_printed_law_is_one_solve_with_the_force_at_the_tip():
 
 
 def test_friction_loads_add_up_to_speed_times_length_times_coefficient():
-    model = FEMModel(GRID, forces=NeedleForces(friction=1e-3))
+    model = FEMModel(GRID, forces=ViscousForces(friction=1e-3))
     total = model.friction_loads(PUSH).sum(axis=0)
     np.testing.assert_allclose(total, 1e-3 * 5.0 * np.array([14.0, 14.0]))
 
 
 def test_withdrawal_drags_the_tissue_back():
-    model = FEMModel(GRID, forces=NeedleForces(0.0, 1e-3, ramp=0.0))
+    model = FEMModel(GRID, forces=ViscousForces(0.0, 1e-3, ramp=0.0))
     out = NeedlePose(PUSH.entry, PUSH.tip, -5.0)
     pushed = model.displacement(model.advance(model.rest(), PUSH, 0.1))
     pulled = model.displacement(model.advance(model.rest(), out, 0.1))
@@ -55,7 +55,7 @@ def test_displacement_is_inversely_proportional_to_youngs_modulus():
 
 
 def test_friction_relaxes_exponentially_once_the_needle_stops():
-    model = FEMModel(GRID, forces=NeedleForces(0.0, 1e-3, alpha3=0.7, ramp=0.0))
+    model = FEMModel(GRID, forces=ViscousForces(0.0, 1e-3, alpha3=0.7, ramp=0.0))
     pushed = model.advance(model.rest(), PUSH, 0.1)
     still = NeedlePose(PUSH.entry, PUSH.tip, 0.0)
     once = model.advance(pushed, still, 1.0)
@@ -66,7 +66,7 @@ def test_friction_relaxes_exponentially_once_the_needle_stops():
 
 @pytest.mark.parametrize("ramp", [0.0, 1.0])
 def test_tip_force_stays_while_the_needle_rests(ramp):
-    model = FEMModel(GRID, forces=NeedleForces(friction=0.0, ramp=ramp))
+    model = FEMModel(GRID, forces=ViscousForces(friction=0.0, ramp=ramp))
     insertion = Insertion.straight((8, 0), 45, 18, 5, dwell=2.0)
     arrived = run(model, Insertion.straight((8, 0), 45, 18, 5), 0.02)
     rested = run(model, insertion, 0.02)
@@ -77,7 +77,7 @@ def test_tip_force_stays_while_the_needle_rests(ramp):
 @pytest.mark.parametrize("steps_per_second", [30, 60, 120])
 def test_the_field_never_jumps(steps_per_second):
     """No node moves further in a step than a few times the needle, through insertion, rest and withdrawal."""
-    model = FEMModel(GRID, forces=NeedleForces(friction=1e-4))
+    model = FEMModel(GRID, forces=ViscousForces(friction=1e-4))
     insertion = Insertion.straight((8, 0), 60, 20, 5, dwell=1.0, retract=True)
     state, worst = model.rest(), 0.0
     dt = 1 / steps_per_second
@@ -89,7 +89,7 @@ def test_the_field_never_jumps(steps_per_second):
 
 
 def test_withdrawn_needle_leaves_tissue_that_comes_to_rest():
-    model = FEMModel(GRID, forces=NeedleForces(friction=1e-4))
+    model = FEMModel(GRID, forces=ViscousForces(friction=1e-4))
     insertion = Insertion.straight((8, 0), 60, 20, 5, retract=True)
     state = run(model, insertion, 1 / 30)
     out = insertion.pose(insertion.duration)
@@ -100,7 +100,7 @@ def test_withdrawn_needle_leaves_tissue_that_comes_to_rest():
 
 def test_step_length_matters_only_to_first_order():
     """Friction that grows with the shaft builds up with travel: the error of a step falls as dt."""
-    model = FEMModel(GRID, forces=NeedleForces(friction=1e-3))
+    model = FEMModel(GRID, forces=ViscousForces(friction=1e-3))
     insertion = Insertion.straight((8, 0), 60, 20, 5)
     fields = [run(model, insertion, 4 / n).displacement for n in (50, 100, 200, 400)]
     steps = [np.abs(a - b).max() for a, b in pairwise(fields)]
@@ -123,7 +123,7 @@ def test_stiff_lesion_deforms_less():
 
 
 def test_only_the_part_of_the_needle_in_the_tissue_acts():
-    model = FEMModel(GRID, forces=NeedleForces(0.4, 1e-3, ramp=0.0))
+    model = FEMModel(GRID, forces=ViscousForces(0.4, 1e-3, ramp=0.0))
     outside = model.advance(model.rest(), NeedlePose((8, -20), (8, -5), 5.0), 0.1)
     assert not outside.displacement.any()
     reaching = model.friction_loads(NeedlePose((8, -20), (8, 5), 5.0))

@@ -1,9 +1,13 @@
 """Plane elasticity against what mechanics knows for certain: patches, manufactured and fundamental solutions."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
-from echospline.errors import InputError
+from echospline import sample_image
+from echospline.errors import InputError, MissingExtraError
 from echospline.mechanics.finite_elements import (
     element_centres,
     factor,
@@ -14,6 +18,7 @@ from echospline.mechanics.finite_elements import (
     shape_functions,
     stiffness,
 )
+from echospline.scenario import Scenario, prepared
 from echospline.scene import RegularGrid
 
 E, NU, THICKNESS = 10.0, 0.45, 5.0  # kPa, 1, mm
@@ -303,3 +308,28 @@ def test_bad_input_is_refused(arguments, message):
 def test_a_floating_tissue_is_refused():
     with pytest.raises(InputError, match="two or more"):
         factor(stiffness(GRID, E, NU, THICKNESS), [3])
+
+
+def test_without_the_extra_superlu_is_the_default_and_cholmod_explains_itself(monkeypatch):
+    def absent(name: str) -> None:
+        raise ImportError(name)
+
+    monkeypatch.setattr("echospline.mechanics.finite_elements.import_module", absent)
+    K = stiffness(GRID, 10.0, 0.3, 1.0)
+    with pytest.raises(MissingExtraError, match=r"kvxopt.*pip install 'echospline\[cholmod\]'"):
+        factor(K, GRID.boundary(BOX), "cholmod")
+    assert factor(K, GRID.boundary(BOX), "superlu").method == "superlu"
+    code = (
+        "import sys; sys.modules['kvxopt'] = None; import importlib.util as u; found = u.find_spec\n"
+        "u.find_spec = lambda name, *a: None if name == 'kvxopt' else found(name, *a)\n"
+        "import echospline as es; print(es.FEMModel(es.RegularGrid((9, 9), (5.0, 5.0))).factored.method)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "superlu"
+
+
+def test_a_command_says_that_superlu_factors(monkeypatch):
+    monkeypatch.setattr("echospline.scenario.scale.find_spec", lambda name: None)
+    _, doubts = prepared(Scenario().with_values({"model.kind": "fem"}), sample_image())
+    assert any("SuperLU" in doubt and "echospline[cholmod]" in doubt for doubt in doubts)
+    assert prepared(Scenario(), sample_image())[1] == []

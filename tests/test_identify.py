@@ -9,10 +9,10 @@ from echospline.mechanics import (
     Elastic,
     FEMModel,
     GreenModel,
-    NeedleForces,
     ThinPlate,
     TPSModel,
     TPSParameters,
+    ViscousForces,
 )
 from echospline.scene import Insertion, RegularGrid, Tissue, distance, field_error
 from echospline.study import ForceFields, Observation, SplineFields, identify
@@ -50,7 +50,7 @@ def observe(model, insertion=PUSH, frames=12, noise=0.0, rest=0.0):
 
 @pytest.fixture(scope="module")
 def fem_truth():
-    return observe(FEMModel(GRID, forces=NeedleForces(0.4, 1e-4, ramp=0.0)))
+    return observe(FEMModel(GRID, forces=ViscousForces(0.4, 1e-4, ramp=0.0)))
 
 
 @pytest.mark.parametrize("kernel", [ThinPlate(), Elastic(0.45, 1.0)], ids=["thin plate", "elastic"])
@@ -67,7 +67,7 @@ def test_spline_fields_are_what_the_model_shows(kernel, solver):
 
 @pytest.mark.parametrize("make", [FEMModel, GreenModel])
 def test_force_fields_are_what_the_model_shows(make):
-    model = make(GRID, forces=NeedleForces(0.3, 2e-3, alpha3=0.8, ramp=0.0))
+    model = make(GRID, forces=ViscousForces(0.3, 2e-3, alpha3=0.8, ramp=0.0))
     seen = observe(model, Insertion.straight((12, 0), 60, 20, 5, dwell=2.0), rest=2.0)
     field = ForceFields(model, seen).fields({"alpha3": 0.8}) @ np.array([0.3, 2e-3])
     np.testing.assert_allclose(field, seen.displacement, atol=1e-9)
@@ -90,7 +90,7 @@ def test_spline_parameters_are_found_again(objective):
 
 
 def test_force_and_relaxation_are_found_again_in_noise():
-    model = FEMModel(GRID, forces=NeedleForces(0.3, 2e-3, alpha3=0.8, ramp=0.0))
+    model = FEMModel(GRID, forces=ViscousForces(0.3, 2e-3, alpha3=0.8, ramp=0.0))
     seen = observe(model, Insertion.straight((12, 0), 60, 20, 5, dwell=2.0), rest=2.0, noise=0.02)
     found = identify(ForceFields(model, seen), "rmse", bootstrap=100)
     assert found.values["tip"] == pytest.approx(0.3, rel=0.02)
@@ -114,6 +114,40 @@ def test_least_distances_agree_with_a_general_optimiser(fem_truth):
     assert found.error.mae <= other.fun * (1 + 1e-5)
 
 
+@pytest.mark.parametrize("objective", ["mae", "rmse"])
+@pytest.mark.parametrize("kernel", [ThinPlate(), Elastic()], ids=["thin plate", "elastic"])
+def test_friction_is_never_negative(kernel, objective):
+    """Above a table alone everything moves along with the needle, and the free minimum asks for friction of the wrong sign."""
+    seen = observe(
+        FEMModel(GRID, ("bottom",), forces=ViscousForces(0.4, 1e-4, ramp=0.0)),
+        Insertion.straight((12, 0), 90, 20, 5),
+    )
+    edges = ("bottom",) if kernel.components == 2 else ("bottom", "left")
+    fields = SplineFields(TPSModel(GRID, edges, printed(), kernel), seen, delta=(1.5,), length=(4.0, 5.0))
+    values = identify(fields, objective, bootstrap=0).values
+    a1, a2, sigma = (values[n] for n in ("alpha1", "alpha2", "sigma"))
+    assert min(a1, a1 + a2 / 2, sigma) >= -1e-12
+
+    # and is the least there is: a general optimiser under the same bounds, from another start, finds none better
+    moved = distance(seen.displacement, 0 * seen.displacement) > 1e-9
+    A, b = fields.fields(values)[moved], seen.displacement[moved]
+    free = np.linalg.lstsq(A.reshape(-1, 3), b.ravel(), rcond=None)[0]
+    assert min(free[0], free[0] + free[1] / 2) < 0
+
+    def cost(x):
+        r2 = ((A @ x - b) ** 2).sum(axis=-1)
+        return float(np.sqrt(r2 + 1e-12).mean() if objective == "mae" else r2.mean())
+
+    bounds = [
+        {"type": "ineq", "fun": lambda x, row=row, low=low: row @ x - low}
+        for row, low in zip(*fields.least, strict=True)
+    ]
+    best = minimize(
+        cost, [0.05, 0.05, 0.5], method="SLSQP", constraints=bounds, options={"maxiter": 500, "ftol": 1e-12}
+    )
+    assert cost([a1, a2, sigma]) <= best.fun * (1 + 1e-4)
+
+
 def test_closed_form_is_no_worse_than_the_grid_and_needs_far_fewer_runs(fem_truth):
     seen = fem_truth.frames(np.array([4, 8, 12]))
     closed = identify(SplineFields(TPSModel(GRID, parameters=printed()), seen, delta=(2.0,)), bootstrap=0)
@@ -135,7 +169,7 @@ def test_closed_form_is_no_worse_than_the_grid_and_needs_far_fewer_runs(fem_trut
 def test_parameters_that_the_data_cannot_tell_are_named(fem_truth):
     """With a band so thin that every contact is equally far, alpha1 and alpha2 act alike."""
     straight = observe(
-        FEMModel(GRID, forces=NeedleForces(0.4, 1e-4, ramp=0.0)), Insertion.straight((20, 0), 90, 20, 5)
+        FEMModel(GRID, forces=ViscousForces(0.4, 1e-4, ramp=0.0)), Insertion.straight((20, 0), 90, 20, 5)
     )
     found = identify(SplineFields(TPSModel(GRID, parameters=printed()), straight, delta=(0.5,)), bootstrap=0)
     assert found.condition > 30
@@ -143,7 +177,7 @@ def test_parameters_that_the_data_cannot_tell_are_named(fem_truth):
 
 
 def test_a_needle_at_rest_tells_nothing_of_friction(fem_truth):
-    still = FEMModel(GRID, forces=NeedleForces(0.4, 0.0, ramp=0.0))
+    still = FEMModel(GRID, forces=ViscousForces(0.4, 0.0, ramp=0.0))
     seen = observe(still)
     slow = Observation(
         seen.points, seen.displacement, seen.times, [type(p)(p.entry, p.tip, 0.0) for p in seen.poses]

@@ -18,6 +18,7 @@ from PIL.PngImagePlugin import PngInfo
 
 from echospline.errors import InputError
 from echospline.io import DisplacementWriter, open_writer, read, read_displacement
+from echospline.io.displacement import LOADS
 from echospline.scene import NeedlePose, RegularGrid
 
 GRID = RegularGrid((33, 21), (0.1, 0.2), (1.5, -2.0))
@@ -181,7 +182,7 @@ def test_a_frame_that_does_not_fit_is_refused_and_leaves_no_final_file(
     with pytest.raises(InputError, match=message):
         write(tmp_path / name, cine, np.array([0.0, at]))
     assert not (tmp_path / name).exists()
-    assert (tmp_path / f"{name}.part").exists()
+    assert list(tmp_path.glob(f"{name}.*.part"))
 
 
 @pytest.mark.parametrize("name", ["a.avi", "a.webm", "a.txt", ".hidden.png"])
@@ -224,6 +225,29 @@ def test_displacement_record_comes_back_whole(tmp_path: Path) -> None:
     assert found.pose(2) == NeedlePose((1.0, 0.0), (2.0, 5.0), 3.0)
     assert found.grid() == RegularGrid((4, 3), (2.0, 3.0), (1.0, -1.0))
     assert [p.name for p in tmp_path.iterdir()] == ["displacement.npz"]
+
+
+def test_forces_are_recorded_for_every_frame_or_for_none(tmp_path: Path) -> None:
+    mesh, at, still = RegularGrid((2, 2), (1.0, 1.0)), NeedlePose((0, 0), (0, 1), 1.0), np.zeros((4, 2))
+    loads = [dict(zip(LOADS, 10.0 * k + np.arange(5), strict=True)) for k in range(3)]
+    with DisplacementWriter(tmp_path / "a.npz", mesh.nodes) as writer:
+        for k, load in enumerate(loads):
+            writer.add(still, float(k), at, load)
+    with np.load(tmp_path / "a.npz") as plain:
+        np.testing.assert_array_equal(plain["torque_N_mm"], [3, 13, 23])
+    found = read_displacement(tmp_path / "a.npz")
+    assert {name: values.tolist() for name, values in found.loads.items()} == {
+        name: [load[name] for load in loads] for name in LOADS
+    }
+    with DisplacementWriter(tmp_path / "b.npz", mesh.nodes) as writer:
+        writer.add(still, 0.0, at)
+        with pytest.raises(InputError, match="every frame or for none"):
+            writer.add(still, 1.0, at, loads[0])
+        with pytest.raises(InputError, match=r"force of the needle at 1\.0 s is not finite"):
+            DisplacementWriter(tmp_path / "c.npz", mesh.nodes).add(
+                still, 1.0, at, loads[0] | {"cut_mm": np.nan}
+            )
+    assert read_displacement(tmp_path / "b.npz").loads == {}
 
 
 KILLED = """
@@ -284,7 +308,8 @@ def test_a_killed_run_leaves_the_old_file_and_a_readable_part(tmp_path: Path, na
         assert not target.exists()
     else:
         assert target.read_bytes() == b"from an earlier run"
-    assert count_frames(tmp_path / f"{name}.part") >= 120
+    (part,) = tmp_path.glob(f"{name}.*.part")
+    assert count_frames(part) >= 120
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "frames"])

@@ -21,7 +21,17 @@ from echospline.openigtlink.image import Image
 from echospline.openigtlink.message import Content, Request, Unread, encode
 from echospline.openigtlink.ndarray import NDArrayMessage
 from echospline.openigtlink.polydata import Point, Points, PolyData
+from echospline.openigtlink.pose import QuaternionTransform, quaternion_of, rotation_of
 from echospline.openigtlink.text import Capability, CommandMessage, CommandReply
+from echospline.openigtlink.tools import (
+    FIVE,
+    SIX,
+    QuaternionTrackingData,
+    StartTracking,
+    Tool,
+    TrackingData,
+    transform_name,
+)
 
 GOLDEN = {
     p.stem: p.read_bytes() for p in sorted((Path(__file__).parent / "openigtlink" / "golden").glob("*.bin"))
@@ -40,7 +50,7 @@ def sealed(kind: str, body: bytes, version: int = 1) -> bytes:
 
 
 def test_the_golden_bytes_are_there() -> None:
-    assert len(GOLDEN) == 15
+    assert len(GOLDEN) == 20
 
 
 def test_check_sum_has_the_catalogued_value_of_crc_64_ecma_182() -> None:
@@ -81,6 +91,66 @@ def test_position_of_the_reference_library_is_read_in_its_three_lengths(
     assert isinstance(content, Position)
     assert content.position == (1.5, -2.5, 3.5)
     assert content.quaternion == quaternion
+
+
+def test_tools_of_the_reference_library_are_read() -> None:
+    content = one(GOLDEN["TrackingData"]).content
+    assert isinstance(content, TrackingData)
+    needle, probe = content.tools
+    assert (needle.name, needle.kind, probe.name, probe.kind) == ("NeedleTipToReference", SIX, "Probe", FIVE)
+    np.testing.assert_array_equal(needle.matrix, MATRIX)
+    np.testing.assert_array_equal(
+        probe.matrix, [[1, 0, 0, 100], [0, 0, -1, 200], [0, 1, 0, -300], [0, 0, 0, 1]]
+    )
+    assert [transform_name(tool) for tool in content.tools] == ["NeedleTipToReference", "ProbeToTracker"]
+
+    content = one(GOLDEN["QuaternionData"]).content
+    assert isinstance(content, QuaternionTrackingData)
+    (stylus,) = content.tools
+    position = one(GOLDEN["Position7"]).content
+    assert isinstance(position, Position)
+    np.testing.assert_allclose(stylus.matrix[:3, :3], position.matrix()[:3, :3], atol=1e-7)
+    np.testing.assert_array_equal(stylus.matrix[:3, 3], (1.5, -2.5, 300.5))
+
+
+def test_the_start_of_a_stream_is_read_as_the_reference_library_packs_it() -> None:
+    message = one(GOLDEN["StartTracking"])
+    assert isinstance(message.content, Request)
+    assert message.type == "STT_TDATA"
+    assert StartTracking.unpack(message.content.body) == StartTracking(50, "Tracker")
+    assert StartTracking(50, "Tracker").pack() == message.content.body
+    assert StartTracking.unpack(b"") == StartTracking()
+    for body in (bytes(35), b"\xff" * 36, b"\0\0\0\1" + b"\xff" * 32):
+        with pytest.raises(ProtocolError):
+            StartTracking.unpack(body)
+
+
+def test_a_position_by_its_old_name_is_read() -> None:
+    data = GOLDEN["Position7"]
+    old = data[:2] + b"QTRANS".ljust(12, b"\0") + data[14:]  # the check sum is of the body alone
+    content = one(old).content
+    assert isinstance(content, QuaternionTransform)
+    assert (content.position, content.quaternion) == ((1.5, -2.5, 3.5), (0.5, -0.5, 0.5, 0.5))
+
+
+def test_numbers_of_one_tool_that_are_no_pose_leave_the_others_readable() -> None:
+    bad = np.full((4, 4), np.nan)
+    tools = (Tool("Lost", bad), Tool("Needle", MATRIX))
+    for content in (TrackingData(tools), QuaternionTrackingData(tools)):
+        back = one(encode(Message(content, "Tracker"))).content
+        assert isinstance(back, type(content))
+        assert np.isnan(back.tools[0].matrix[:3]).any()
+        np.testing.assert_allclose(back.tools[1].matrix, MATRIX, atol=1e-6)
+
+
+@given(st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 0.1))
+def test_quaternion_and_matrix_are_those_of_scipy_and_each_others_inverse(q: list[float]) -> None:
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415
+
+    x, y, z, w = np.array(q) / np.linalg.norm(q)
+    matrix = rotation_of((x, y, z, w))
+    np.testing.assert_allclose(matrix, Rotation.from_quat([x, y, z, w]).as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(rotation_of(quaternion_of(matrix)), matrix, atol=1e-12)
 
 
 def test_quaternion_turns_as_scipy_says() -> None:
@@ -197,6 +267,9 @@ def test_the_cuts_of_a_stream_do_not_matter(cuts: list[int]) -> None:
 CONTENTS: list[Content] = [
     Transform(MATRIX),
     Position((1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0)),
+    QuaternionTransform((1.0, 2.0, 3.0), (0.0, 0.6, 0.0, 0.8)),
+    TrackingData((Tool("NeedleTipToReference", MATRIX), Tool("Probe", np.eye(4), FIVE))),
+    QuaternionTrackingData((Tool("NeedleTipToReference", MATRIX), Tool("Probe", np.eye(4), FIVE))),
     Image(np.arange(24, dtype=np.uint8).reshape(1, 4, 6), np.diag([0.5, 0.25, 1, 1])),
     Image(np.arange(24, dtype=np.uint8).reshape(1, 2, 4, 3), np.eye(4)),
     Status(1, 0, "", "working"),
@@ -311,6 +384,11 @@ MALFORMED = {
     "transform too short": ("TRANSFORM", bytes(47), 1),
     "transform of NaN": ("TRANSFORM", struct.pack(">f", np.nan) * 12, 1),
     "position of 16 bytes": ("POSITION", bytes(16), 1),
+    "quaternion transform of 16 bytes": ("QTRANS", bytes(16), 1),
+    "tools of 71 bytes": ("TDATA", b"Needle".ljust(20, b"\0") + bytes(51), 1),
+    "tool without a name": ("TDATA", bytes(70), 1),
+    "tool whose name is no text": ("TDATA", b"\xff" * 70, 1),
+    "quaternion tools of 70 bytes": ("QTDATA", b"Needle".ljust(20, b"\0") + bytes(50), 1),
     "image without pixels": ("IMAGE", IMAGE_HEAD, 1),
     "image of 65535 x 65535 x 65535": (
         "IMAGE",

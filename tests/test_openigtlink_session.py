@@ -494,6 +494,8 @@ def test_the_command_runs_and_refuses_in_words() -> None:
         (["--no-serve"], "nothing to do"),
         (["--target", "1"], "X,Y in mm"),
         (["--fps", "0"], "--fps"),
+        (["--silence", "0"], "silence"),
+        (["--ask", "IMAGE"], "TDATA, QTDATA, QTRANS, POSITION"),
     ]:
         bad = runner.invoke(app, ["link", "--port", "0", "--duration", "0.1", *arguments])
         assert isinstance(bad.exception, InputError)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from echospline.errors import InputError
-from echospline.mechanics import TPSParameters
+from echospline.mechanics import NeedleForces, TPSParameters, ViscousForces
 from echospline.picture import NeedleEcho
 from echospline.scenario import MODELS, Scenario, build_model, describe, load, validated
 from echospline.scenario.sections import LandmarkSection
@@ -135,7 +135,7 @@ def test_saved_and_loaded_again_it_is_the_same(full, tmp_path):
         ({"needle": {"echo": {"latral": 1}}}, ["needle.echo.latral", "did you mean lateral"]),
         ({"needle": {"echo": {"opacity": 2.0}}}, ["needle.echo", "opacity of a needle must be from 0 to 1"]),
         ({"output": {"inverse": "fast"}}, ["output.inverse = 'fast'", "'exact'"]),
-        ({"format": 2}, ["format = 2", "1"]),
+        ({"format": 3}, ["format = 3", "2"]),
         ({"image": 3}, ["image = 3"]),
     ],
 )
@@ -175,7 +175,42 @@ def test_profiles_and_regions_that_make_no_sense_are_refused(tmp_path):
 
 
 def test_defaults_are_those_of_the_model():
-    assert LandmarkSection().model_dump() == vars(TPSParameters())
+    said = LandmarkSection().model_dump()
+    assert said.pop("anchor_spacing") is None
+    assert said == {name: value for name, value in vars(TPSParameters()).items() if name != "anchor_spacing"}
+
+
+def test_a_file_of_format_1_means_what_it_meant(tmp_path):
+    old = validated(
+        {"format": 1, "mesh": {"nodes": [9, 9]}, "model": {"landmarks": {"sigma": 0.5}}}, "old.toml"
+    )
+    assert old.format == 2
+    assert (old.mesh.sliding, old.model.kind) == ([], "tps")
+    assert (old.model.landmarks.loading, old.model.landmarks.sigma, old.model.forces.law) == (
+        "follow",
+        0.5,
+        "viscous",
+    )
+    chosen = validated({"format": 1, "model": {"kind": "fem", "forces": {"law": "stick-slip"}}}, "old.toml")
+    assert (chosen.model.kind, chosen.model.forces.law) == ("fem", "stick-slip")
+    old.save(tmp_path / "again.toml", tmp_path)
+    assert load(tmp_path / "again.toml") == old
+    with pytest.raises(InputError, match="mesh = 3"):
+        validated({"format": 1, "mesh": 3}, "old.toml")
+
+
+def test_the_skin_slides_under_the_probe_unless_the_top_is_clamped_or_free():
+    assert validated({}, "x").mesh.sliding == ["top"]
+    assert validated({"mesh": {"clamped": ["top", "bottom"]}}, "x").mesh.sliding == []
+    assert validated({"mesh": {"clamped": ["bottom"]}}, "x").mesh.sliding == ["top"]
+    assert validated({"mesh": {"sliding": []}}, "x").mesh.sliding == []
+    assert validated({}, "x").with_values({"mesh.clamped": ["top", "left"]}).mesh.sliding == []
+    grid = RegularGrid((12, 9), (3, 3))
+    beside = validated({}, "x")
+    assert build_model(beside, grid, kind="elastic").parameters.anchor_spacing == 1.0
+    assert build_model(beside, grid, kind="tps").parameters.anchor_spacing == 1.5
+    free = beside.with_values({"mesh.sliding": []})
+    assert build_model(free, grid, kind="elastic").parameters.anchor_spacing == 1.5
 
 
 @pytest.mark.parametrize("kind", MODELS)
@@ -208,3 +243,26 @@ def test_any_tree_is_a_scenario_or_an_input_error(tree):
     except InputError:
         return
     assert isinstance(scenario, Scenario)
+
+
+def test_the_law_of_forces_is_the_one_named_or_that_of_an_old_files_numbers():
+    grid = RegularGrid((6, 5), (8.0, 8.0))
+
+    def law(**table):
+        scene = validated({"model": {"kind": "fem", "forces": table}}, "test")
+        return build_model(scene, grid).forces
+
+    assert law() == NeedleForces()
+    assert law(friction_limit="0.02 N/mm", dead_band=0.15) == NeedleForces(
+        friction_limit=0.02, dead_band=0.15
+    )
+    assert law(law="viscous") == ViscousForces(friction=1e-3)
+    assert law(tip=0.3, friction=2e-3, ramp=0.0) == ViscousForces(0.3, 2e-3, ramp=0.0)
+
+
+def test_a_number_of_the_viscous_law_is_refused_by_the_other():
+    scene = validated({"model": {"kind": "fem"}}, "test")
+    with pytest.raises(InputError, match=r'model\.forces\.ramp belongs to the viscous law .* "viscous" too'):
+        scene.with_values({"model.forces.ramp": 0.0})
+    changed = scene.with_values({"model.forces.ramp": 0.0, "model.forces.law": "viscous"})
+    assert changed.model.forces.ramp == 0.0

@@ -18,6 +18,7 @@ from echospline.study import study, table, write_report
 from echospline.study.accuracy import CLAMPED, HELD_OUT, Case, brute_force, observe, oracle
 from echospline.study.claims import claims
 from echospline.study.paper import Extent
+from echospline.study.scenes import MODELS, SCENES
 from echospline.study.speed import mesh_of, savings
 
 TINY = Extent(
@@ -46,7 +47,7 @@ def test_every_file_is_there_and_whole(done):
         with Image.open(out / f"{name}.png") as picture:
             picture.verify()
         assert "</svg>" in (out / f"{name}.svg").read_text()[-20:]
-    for name in ("accuracy", "speed", "savings"):
+    for name in ("accuracy", "scenes", "linearity", "speed", "savings"):
         rows = json.loads((out / f"{name}.json").read_text())
         with (out / f"{name}.csv").open(newline="") as file:
             assert len(list(csv.DictReader(file))) == len(rows) > 0
@@ -65,6 +66,33 @@ def test_accuracy_rows_carry_the_agreed_keys_for_four_moduli_in_both_readings(do
     both = {(row["model"], row["kernel"], row["held_out"]) for row in rows}
     assert {("tps", "thin plate", True), ("tps", "elastic", True), ("green", "half-plane", True)} <= both
     assert all(row["mae_mm"] <= row["rmse_mm"] <= row["worst_mm"] for row in rows)
+
+
+def test_every_model_answers_or_refuses_every_scene(done):
+    rows = done[1]["scenes"]
+    assert {(row["scene"], row["model"]) for row in rows} == {(s.name, m) for s in SCENES for m in MODELS}
+    for row in rows:
+        if row["refused"] is None:
+            assert 0 < row["mae_percent_of_mean"] <= row["worst_pose_percent"], row
+        else:
+            assert len(row["refused"]) > 20
+            assert "mae_mm" not in row
+    answered = {(row["scene"], row["model"]) for row in rows if row["refused"] is None}
+    assert {(SCENES[0].name, m) for m in MODELS} <= answered
+    assert (SCENES[2].name, "tps") in answered  # a soft lesion
+    mesh = [row["mae_percent_of_mean"] for row in rows if row["model"] == "fem" and row["refused"] is None]
+    assert 0 < max(mesh) < 12  # what the coarse mesh of this test costs
+
+
+def test_the_distance_of_linear_elasticity_grows_with_the_motion(done):
+    for plane in ("stress", "strain"):
+        rows = [row for row in done[1]["linearity"] if row["plane"] == plane]
+        assert [row["peak_mm"] for row in rows] == [0.2, 1.0, 3.0]
+        shares = [row["difference_percent_of_mean"] for row in rows]
+        assert 0 < shares[0] < 1.5
+        assert 4 < shares[1] / shares[0] < 7  # five times the motion: nearly linear
+        assert shares[2] > 2 * shares[1]
+        assert f"{shares[1]:.1f} % at 1 mm" in (done[0] / "report.html").read_text()
 
 
 def test_speed_rows_carry_the_agreed_keys_and_name_every_method(done):
@@ -98,11 +126,12 @@ def test_report_is_one_self_contained_page(done):
 
 def test_a_second_run_takes_the_cases_from_the_disk(done, tmp_path):
     out, result, said = done
-    assert sum(line.startswith("accuracy:") for line in said) == 9
+    assert sum(line.startswith("accuracy:") for line in said) == 9 + len(SCENES)
     again = []
     repeated = study(out, TINY, seed=1, report=again.append)
     assert not any(line.startswith("accuracy:") for line in again)
     assert repeated["accuracy"] == result["accuracy"]
+    assert repeated["scenes"] == result["scenes"]
 
 
 def test_oracle_landmarks_bound_what_any_law_can_reach():
@@ -198,7 +227,7 @@ def test_a_scenario_with_a_stiff_region_holds_landmarks_back_there(tmp_path):
     grid = RegularGrid((21, 16), (2.0, 2.0))
     insertion = Insertion.straight((14.0, 0.0), 65.0, 13.0)
     inside = Circle((20.0, 12.0), 5.0).contains(grid.nodes)
-    for kind in ("tps", "elastic", "fem"):
+    for kind in ("tps", "elastic", "fem", "green"):
         largest = []
         for s in (scene, with_lesion):
             model = build_model(s, grid, kind=kind)
@@ -207,5 +236,3 @@ def test_a_scenario_with_a_stiff_region_holds_landmarks_back_there(tmp_path):
                 state = model.advance(state, insertion.pose(t), 0.2)
             largest.append(np.hypot(*model.displacement(state)[inside].T).max())
         assert largest[1] < 0.8 * largest[0], kind
-    with pytest.raises(InputError, match="homogeneous"):
-        build_model(with_lesion, grid, kind="green")

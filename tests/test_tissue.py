@@ -54,11 +54,21 @@ def test_labels_image_gives_regions_in_mm():
     assert label.contains(points).tolist() == [True, True, False, False, False, False]
 
 
-def test_cells_share_a_lesion_by_area():
-    tissue = Tissue(10.0, 0.45, [Region(Circle((20, 15), 6.3), 110.0)])
-    young, _ = tissue.in_cells(GRID, samples=16)
-    area = (young - 10).sum() / 100.0
-    assert area == pytest.approx(np.pi * 6.3**2, rel=2e-3)
+def test_compliance_of_cells_shares_a_lesion_by_area():
+    tissue = Tissue(10.0, 0.45, [Region(Circle((20, 15), 6.3), 110.0, 0.3)])
+    young, poisson = tissue.in_cells(GRID, samples=16)
+    for compliance, outside, inside in (
+        (1 / young, 1 / 10.0, 1 / 110.0),
+        (poisson / young, 0.45 / 10.0, 0.3 / 110.0),
+    ):
+        area = ((compliance - outside) / (inside - outside)).sum()
+        assert area == pytest.approx(np.pi * 6.3**2, rel=2e-3)
+
+
+def test_samples_of_a_cell_lie_in_it_x_fastest():
+    tissue = Tissue(10.0, 0.45, [Region(Layer(0, 0.5), 20.0), Region(Circle((0.25, 0.75), 0.1), 30.0)])
+    young, _ = tissue.sampled(GRID, np.array([0, 41]), 2)
+    assert young.tolist() == [[20, 20, 30, 10], [10, 10, 10, 10]]
 
 
 def test_cells_run_x_fastest():

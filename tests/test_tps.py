@@ -52,8 +52,8 @@ def test_one_step_equals_algorithm_1_by_another_library():
     near = (d <= 1.5) & (along <= pose.depth - 0.25 * 40 / 39) & ~clamped
     assert near.sum() > 20
     f = (0.05 + 0.3 / (1 + np.exp(d[near]))) * 5.0
-    landmarks = np.vstack([model.anchors, GRID.nodes[near], [pose.tip]])
-    moves = np.vstack([np.zeros_like(model.anchors), f[:, None] * a, [a]])
+    landmarks = np.vstack([model.anchors.places, GRID.nodes[near], [pose.tip]])
+    moves = np.vstack([np.zeros_like(model.anchors.places), f[:, None] * a, [a]])
     theirs = RBFInterpolator(landmarks, moves, kernel="thin_plate_spline")(GRID.nodes)
     np.testing.assert_allclose(ours, theirs, atol=1e-8)
 
@@ -69,7 +69,7 @@ def test_node_tip_moves_the_nearest_node_to_its_target():
 
 def test_anchors_hold():
     model = TPSModel(GRID)
-    u = model.displacement_at(drive(model, Insertion.straight((12, 0), 55, 20), 1 / 60), model.anchors)
+    u = model.displacement_at(drive(model, Insertion.straight((12, 0), 55, 20), 1 / 60), model.anchors.places)
     assert np.abs(u).max() < 1e-9
 
 
@@ -99,7 +99,8 @@ def test_halving_dt_changes_nothing_in_relaxation():
 
 def test_at_rest_the_field_keeps_its_shape_and_fades():
     path = Insertion.straight((8, 0), 40, 25, 8.0, dwell=3.0)
-    for model in (TPSModel(GRID), TPSModel(GRID, solver="refit")):
+    follow = TPSParameters(loading="follow")
+    for model in (TPSModel(GRID, parameters=follow), TPSModel(GRID, parameters=follow, solver="refit")):
         state = model.advance(drive(model, path, 1 / 40, duration=3.125), path.pose(3.2), 0.0)
         before, after = model.displacement(state), []
         for _ in range(4):
@@ -109,7 +110,7 @@ def test_at_rest_the_field_keeps_its_shape_and_fades():
             np.testing.assert_allclose(u, before * np.exp(-0.5 * (k + 1)), atol=1e-6)
 
 
-@pytest.mark.parametrize("loading", ["follow", "immediate"])
+@pytest.mark.parametrize("loading", ["stick", "follow", "immediate"])
 def test_rest_after_a_push_does_not_depend_on_the_frame_rate(loading):
     parameters = TPSParameters(loading=loading)
     model = TPSModel(GRID, parameters=parameters, precision="double")
@@ -127,8 +128,7 @@ def test_a_finer_step_approaches_one_answer():
     path = Insertion.straight((12, 0), 60, 15, 5.0)
     u = [model.displacement(drive(model, path, dt)) for dt in (1 / 30, 1 / 60, 1 / 240)]
     coarse, fine = (np.abs(v - u[2]).max() for v in u[:2])
-    assert fine < 0.75 * coarse
-    assert coarse < 0.2  # mm, of a largest displacement above 1 mm
+    assert max(coarse, fine) < 0.01  # mm, of a largest displacement of 1 mm
 
 
 @pytest.mark.parametrize(("precision", "within"), [("double", 1e-9), ("single", 5e-6)])
@@ -167,7 +167,7 @@ def test_withdrawal_drags_tissue_back_and_leaves_it_at_rest_in_the_end():
 def test_tilting_drags_the_tissue_sideways_as_far_as_drag_says():
     turned = []
     for drag in (0.0, 1.0):
-        model = TPSModel(GRID, parameters=TPSParameters(drag=drag))
+        model = TPSModel(GRID, parameters=TPSParameters(drag=drag, loading="follow"))
         state = drive(model, Insertion.straight((20, 0), 90, 15, 5.0), 1 / 30)
         for k in range(20):
             angle = np.radians(90 - 0.5 * (k + 1))
@@ -230,7 +230,7 @@ def test_odd_places_give_finite_fields(pose):
         u = model.displacement(state)
         assert np.isfinite(u).all()
         assert np.abs(u).max() < 20
-    assert np.abs(model.displacement_at(state, model.anchors)).max() < 1e-6
+    assert np.abs(model.displacement_at(state, model.anchors.places)).max() < 1e-6
 
 
 def test_the_push_fades_towards_a_clamped_edge():
@@ -271,8 +271,8 @@ def test_parameters_out_of_range_are_refused(change, message):
 def test_a_scene_that_nothing_holds_is_refused():
     with pytest.raises(InputError, match="leaves it free to slide"):
         TPSModel(GRID, clamped=())
-    with pytest.raises(InputError, match="one line"):
-        TPSModel(GRID, clamped=("left",))
+    with pytest.raises(InputError, match="no edge holds the x direction, and 1 clamped point on one line"):
+        TPSModel(GRID, clamped=(), sliding=("top",), clamped_points=[(8.0, 12.0)])
     with pytest.raises(InputError, match="dt must be"):
         TPSModel(GRID).advance(TPSModel(GRID).rest(), NeedlePose((0, 0), (0, 0)), -1.0)
 

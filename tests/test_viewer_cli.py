@@ -6,12 +6,14 @@ import csv
 import json
 import re
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from typer.testing import CliRunner
 
 from echospline.cli.app import app
@@ -19,13 +21,16 @@ from echospline.cli.live import opener_for, scene_of
 from echospline.cli.options import scenario_from
 from echospline.cli.sessions import keyframes
 from echospline.errors import InputError
-from echospline.io import read_displacement
+from echospline.io import read_displacement, read_image
 from echospline.live import Trace
+from echospline.openigtlink import Message, Transform
+from echospline.openigtlink.message import encode
 from echospline.scenario import MODELS
-from echospline.scene import Insertion
+from echospline.scene import AXIAL, ImagingPlane, Insertion, NeedlePose
 from echospline.viewer import Sessions, score
 from echospline.viewer.protocol import SPLINE
-from test_viewer_server import page
+from live_scene import running
+from test_viewer_server import get, page
 
 PERIOD = 1 / 120
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
@@ -88,6 +93,35 @@ def test_live_serves_the_page_and_the_real_model_and_ends_when_told(tmp_path):
     assert (tmp_path / "deep" / "kept.sqlite").exists()
 
 
+def test_a_tracker_that_is_lost_is_said_on_the_page_of_live_with_its_link(tmp_path):
+    command = [sys.executable, "-m", "echospline", "live", "--no-browser", "--port", "0", "--mesh", "12x9", "--link",
+               "--link-port", "0", "--link-silence", "1.5", "--sessions", str(tmp_path / "kept.sqlite")]  # fmt: skip
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            said = ""
+            while "sessions are kept" not in said:
+                said += process.stderr.readline()
+            address = re.search(r"http://\S+", said).group().rstrip("/")
+            port = int(re.search(r"OpenIGTLink on 127\.0\.0\.1:(\d+)", said).group(1))
+            tip = ImagingPlane(AXIAL).tip_matrix(NeedlePose((20.0, 0.0), (20.0, 8.0)))
+            with page(address) as client, socket.create_connection(("127.0.0.1", port)) as tracker:
+                tracker.sendall(encode(Message(Transform(tip), "NeedleTipToReference")))
+                client.until(lambda f: f.tip[1] > 7.0, timeout=30)
+                bad = Message(
+                    Transform(np.eye(4)), "NeedleTipToReference", 0.0, 2, {"TransformStatus": "MISSING"}
+                )
+                tracker.sendall(encode(bad))
+                assert "NeedleTipToReference is MISSING" in client.hear("tracker")["text"]
+                assert client.until(lambda f: True).tip[1] > 7.0
+                tracker.sendall(encode(Message(Transform(tip), "NeedleTipToReference")))
+                assert client.hear("tracker")["text"] == ""
+                assert "silent for 1.5 s" in client.hear("tracker")["text"]
+        finally:
+            process.send_signal(signal.SIGINT)
+            assert process.wait(60) == 0
+        assert "Traceback" not in process.stderr.read()
+
+
 def test_every_model_can_be_steered_in_a_scene():
     scene, _ = small_scene()
     for name, _ in scene.names:
@@ -108,8 +142,6 @@ def test_a_needle_outside_the_image_is_refused():
 def test_an_uploaded_picture_becomes_a_scene(tmp_path):
     _, scenario = small_scene()
     picture = tmp_path / "a.png"
-    from PIL import Image  # noqa: PLC0415
-
     Image.fromarray(np.full((50, 80), 90, np.uint8)).save(picture)
     opened = opener_for(scenario)(picture, (0.5, 0.5))
     assert opened.grid.extent == pytest.approx((0.0, 39.5, 0.0, 24.5))
@@ -142,6 +174,36 @@ def test_a_session_becomes_a_cine_with_its_true_motion(kept, tmp_path):
         exact = np.interp(record.times + trace.times[0], trace.times, trace.tip[:, axis])
         np.testing.assert_allclose(record.tip[:, axis], exact, atol=1e-6)
     assert np.abs(record.displacement[-1]).max() > 0.1
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_a_session_in_an_uploaded_picture_becomes_a_cine_when_the_server_is_gone(tmp_path, moved):
+    """Also after its file and the folder beside it were moved."""
+    picture = tmp_path / "mine.png"
+    pixels = np.random.default_rng(1).integers(0, 200, (120, 160), dtype=np.uint8)
+    Image.fromarray(pixels).save(picture)
+    _, scenario = small_scene(**{"output.formats": "mha", "output.figure": False, "output.fps": "20"})
+    path = tmp_path / "served" / "sessions.sqlite"
+    with running(tmp_path / "served", opener=opener_for(scenario)) as (address, _, _):
+        status, _, said = get(address, "/api/upload?name=mine.png&spacing=0.25", "POST", picture.read_bytes())
+        assert status == 200
+        with page(address, f"?scene={json.loads(said)['scene']}") as client:
+            name = client.hello["scene"]["exercises"][0]["name"]
+            client.ask(do="start", exercise=name, trainee="Di")
+            client.hear("running")
+            client.push(5.0, entry=tuple(client.hello["pose"]["entry"]))
+            client.ask(do="finish", keep=True)
+            number = client.hear("summary")["session"]
+    picture.unlink()
+    if moved:
+        path = (tmp_path / "served").rename(tmp_path / "elsewhere") / path.name
+    both = json.loads(invoke("sessions", "rescore", number, "--sessions", path).output)
+    assert both["stored"] == both["now"]
+    invoke("sessions", "cine", number, "--out", tmp_path / "out", "--sessions", path)
+    first = read_image(tmp_path / "out" / "cine.mha")
+    assert first.grid.shape == (160, 120)
+    assert first.grid.spacing == pytest.approx((0.25, 0.25))
+    assert np.abs(read_displacement(tmp_path / "out" / "displacement.npz").displacement[-1]).max() > 0.05
 
 
 def test_keyframes_keep_the_path(kept):

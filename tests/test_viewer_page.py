@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import shutil
+import socket
 import time
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -18,10 +19,10 @@ from echospline.live import Command, Snapshot
 from echospline.mechanics import Elastic, ThinPlate
 from echospline.mechanics.spline import factor
 from echospline.scene import NeedlePose, RegularGrid, UltrasoundImage
-from echospline.viewer import Settings
+from echospline.viewer import Settings, announce
 from echospline.viewer.protocol import encode_frame
 from echospline.viewer.served_scene import PAGE_LOOK
-from live_scene import IMAGE_GRID, MESH, running, scene
+from live_scene import IMAGE_GRID, MESH, running, scene, speckle
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 FLAGS = [
@@ -498,3 +499,90 @@ def test_the_image_at_rest_is_shown_pixel_by_pixel(live):
     ) / 4  # pixel centres of the canvas lie between
     assert IMAGE_GRID.shape == (161, 121)
     assert np.abs(got - between).max() <= 2
+
+
+# --- bad lines
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def test_a_run_that_was_lost_in_a_restart_is_said_and_can_be_started_again(page, context, tmp_path):
+    context.expected_faults = 50  # of the browser: it cannot connect meanwhile
+    settings = Settings(port=free_port())
+    with running(tmp_path, settings=settings) as (address, _, _):
+        visit(page, address)
+        page.locator("#start").click()
+        expect(page.locator("#exercise-status")).to_contain_text("Recording")
+        hold(page, "ArrowDown", "Number(d.depth) > 2")
+    expect(page.locator("#fault")).to_contain_text("connection")
+    with running(tmp_path, settings=settings):
+        expect(page.locator("#fault")).to_contain_text("your run of “Straight down” is lost")
+        expect(page.locator("#start")).to_have_text("Start")
+        page.locator("#start").click()
+        expect(page.locator("#exercise-status")).to_contain_text("Recording")
+        expect(page.locator("#fault")).to_be_hidden()
+
+
+def test_a_short_break_of_the_line_loses_no_run(page, context, tmp_path):
+    context.expected_faults = 50
+    with running(tmp_path) as (address, _, app):
+        visit(page, address)
+        page.locator("#start").click()
+        expect(page.locator("#exercise-status")).to_contain_text("Recording")
+        (client,) = app.state.room.pages
+        client._loop.call_soon_threadsafe(lambda: client._loop.create_task(client.socket.close(1012)))
+        expect(page.locator("#fault")).to_contain_text("connection")
+        expect(page.locator("#fault")).to_be_hidden()
+        expect(page.locator("#exercise-status")).to_contain_text("Recording")
+
+
+def test_a_lost_tracker_is_shown_until_it_is_back(page, tmp_path):
+    with running(tmp_path) as (address, _, app):
+        visit(page, address)
+        announce(
+            app,
+            "The tracker: stale: NeedleToTracker has been silent for 0.5 s; the needle stays where it was",
+        )
+        expect(page.locator("#fault")).to_contain_text("silent for 0.5 s")
+        announce(app, "")
+        expect(page.locator("#fault")).to_be_hidden()
+        expect(page.locator("#notice")).to_contain_text("tracker is back")
+
+
+def test_a_session_of_an_uploaded_picture_is_replayed_there_from_another_picture(page, tmp_path):
+    other = UltrasoundImage(255 - speckle(), IMAGE_GRID)
+    with running(tmp_path, opener=lambda path, spacing: scene(title="Uploaded", image=other)) as (
+        address,
+        _,
+        _,
+    ):
+        visit(page, address)
+        (tmp_path / "a.png").write_bytes(b"the opener of this test looks at nothing")
+        page.locator("#open").click()
+        page.locator("#upload-file").set_input_files(tmp_path / "a.png")
+        page.locator("#upload-form button[type=submit]").click()
+        expect(page.locator("#title")).to_have_text("Uploaded")
+        page.locator("#start").click()
+        expect(page.locator("#exercise-status")).to_contain_text("Recording")
+        hold(page, "ArrowDown", "Number(d.depth) > 3")
+        page.keyboard.press("e")
+        expect(page.locator("#summary")).to_be_visible()
+        page.evaluate("sessionStorage.setItem('scene', '')")
+    settings = Settings(port=free_port())  # started again
+    with running(
+        tmp_path, settings=settings, opener=lambda path, spacing: scene(title="Uploaded", image=other)
+    ) as (
+        address,
+        _,
+        _,
+    ):
+        visit(page, address)
+        expect(page.locator("#title")).to_have_text("Speckle")
+        page.keyboard.press("l")
+        page.locator("#session-rows button", has_text="Replay").first.click()
+        expect(page.locator("#title")).to_have_text("Uploaded")
+        expect(page.locator("#exercise-status")).to_contain_text("Replay")

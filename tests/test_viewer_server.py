@@ -16,7 +16,7 @@ from websockets.sync.client import connect
 
 from echospline.errors import InputError
 from echospline.scene import UltrasoundImage
-from echospline.viewer import Sessions, Settings, build_app, serve
+from echospline.viewer import Sessions, Settings, UploadLimits, build_app, serve
 from echospline.viewer.client import IN_FLIGHT
 from echospline.viewer.guard import Allowance, Guard
 from echospline.viewer.protocol import (
@@ -505,7 +505,8 @@ def opener(path, spacing):
 
 @pytest.fixture(scope="module")
 def uploading(tmp_path_factory):
-    with running(tmp_path_factory.mktemp("uploads"), opener=opener) as (address, _, _):
+    settings = Settings(port=0, uploads=UploadLimits(size=10_000))
+    with running(tmp_path_factory.mktemp("uploads"), settings=settings, opener=opener) as (address, _, _):
         yield address
 
 
@@ -539,9 +540,8 @@ def test_a_wrong_upload_is_refused_with_a_reason(uploading, query, body, status)
     assert len(text) > 10
 
 
-def test_a_large_upload_is_refused_before_it_is_kept(uploading, monkeypatch):
-    monkeypatch.setattr("echospline.viewer.server.UPLOAD_BYTES", 1000)
-    status, _, _text = get(uploading, "/api/upload?name=a.png&spacing=1", "POST", b"good" * 1000)
+def test_a_large_upload_is_refused_before_it_is_kept(uploading):
+    status, _, _text = get(uploading, "/api/upload?name=a.png&spacing=1", "POST", b"good" * 3000)
     assert status == 413
 
 

@@ -17,6 +17,7 @@ struct Message {
 
 struct TissueEntries;   // scenes and tissues: tissue_entries.hpp
 struct PictureEntries;  // pictures: picture_entries.hpp
+struct ForceEntries;    // tissue under a needle's forces: force_entries.hpp
 struct SpaceEntries;    // volumes and fields of forces: space_entries.hpp
 
 /// One level of the processor.
@@ -24,6 +25,7 @@ struct Level {
   int32_t id;
   const TissueEntries* tissue;
   const PictureEntries* picture;
+  const ForceEntries* force;
   const SpaceEntries* space;
 };
 

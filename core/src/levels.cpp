@@ -116,6 +116,7 @@ const char* echospline_status_text(echospline_status status) {
     case ECHOSPLINE_NOT_SOLVED: return "not solved";
     case ECHOSPLINE_WRONG_STATE: return "wrong state";
     case ECHOSPLINE_FAILED_HANDLE: return "failed handle";
+    case ECHOSPLINE_NEEDS_STATION: return "needs station";
     default: return "unknown status";
   }
 }

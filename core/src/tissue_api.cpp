@@ -78,7 +78,7 @@ echospline_status check_choices(const echospline_scene_options& o, Message& m) {
   } choices[] = {{"kernel", o.kernel, ECHOSPLINE_ELASTIC},
                  {"precision", o.precision, ECHOSPLINE_DOUBLE},
                  {"tip", o.tip, ECHOSPLINE_TIP_NODE},
-                 {"loading", o.loading, ECHOSPLINE_IMMEDIATE},
+                 {"loading", o.loading, ECHOSPLINE_STICK},
                  {"plane", o.plane, ECHOSPLINE_PLANE_STRAIN}};
   for (const auto& choice : choices)
     if (choice.value < 0 || choice.value > choice.last)
@@ -88,6 +88,13 @@ echospline_status check_choices(const echospline_scene_options& o, Message& m) {
   if (o.clamped & ~edges)
     return refuse(m, ECHOSPLINE_WRONG_VALUE, "clamped must be bits of ECHOSPLINE_LEFT ... in %d dimensions; got %u",
                   o.dimension, o.clamped);
+  if (o.sliding & ~edges)
+    return refuse(m, ECHOSPLINE_WRONG_VALUE, "sliding must be bits of ECHOSPLINE_LEFT ... in %d dimensions; got %u",
+                  o.dimension, o.sliding);
+  if (o.clamped & o.sliding)
+    return refuse(m, ECHOSPLINE_WRONG_VALUE,
+                  "an edge is clamped, sliding or free; got clamped %u and sliding %u, which share an edge", o.clamped,
+                  o.sliding);
   return ECHOSPLINE_OK;
 }
 
@@ -101,6 +108,7 @@ echospline_status check_numbers(const echospline_scene_options& o, Message& m) {
                           {"alpha3", o.alpha3, 0, huge, "1/s"},
                           {"length", o.length, 1e-9, huge, "mm"},
                           {"drag", o.drag, 0, 1, "(no unit)"},
+                          {"friction_speed", o.friction_speed, 0, huge, "mm/s"},
                           {"contact_spacing", o.contact_spacing, 0, huge, "mm"},
                           {"anchor_spacing", o.anchor_spacing, 1e-3, huge, "mm"},
                           {"poisson", o.poisson, 0, stress ? 0.5 : 0.4999999, "(no unit)"},
@@ -125,19 +133,21 @@ echospline_status check_clamped(const echospline_scene_options& o, Message& m) {
         return refuse(m, ECHOSPLINE_WRONG_VALUE, "every clamped point must lie inside the mesh; point %lld does not",
                       static_cast<long long>(i));
     }
-  double anchors = static_cast<double>(o.clamped_point_count);
+  const double per = o.kernel == ECHOSPLINE_ELASTIC ? o.dimension : 1;
+  double anchors = static_cast<double>(o.clamped_point_count) * per;
   for (int edge = 0; edge < 2 * o.dimension; ++edge) {
-    if (!(o.clamped >> edge & 1)) continue;
-    double on_edge = 1;
+    if (!((o.clamped | o.sliding) >> edge & 1)) continue;
+    double on_edge = o.clamped >> edge & 1 ? per : 1;
+    // where no other edge holds a component, a thin plate has a second row
+    if (o.kernel == ECHOSPLINE_THIN_PLATE && !(o.clamped & ~(1u << edge))) on_edge *= 2;
     for (int d = 0; d < o.dimension; ++d)
       if (d != edge / 2) on_edge *= std::ceil((o.shape[d] - 1) * o.spacing[d] / o.anchor_spacing) + 1;
     anchors += on_edge;
   }
-  const double per = o.kernel == ECHOSPLINE_ELASTIC ? o.dimension : 1;
-  if (anchors * per > static_cast<double>(MOST_ANCHORS))
+  if (anchors > static_cast<double>(MOST_ANCHORS))
     return refuse(m, ECHOSPLINE_WRONG_SIZE,
-                  "what is clamped may have %lld anchors (elastic: components); got %.0f: raise anchor_spacing",
-                  static_cast<long long>(MOST_ANCHORS), anchors * per);
+                  "what is held may have %lld anchors (elastic: components); got %.0f: raise anchor_spacing",
+                  static_cast<long long>(MOST_ANCHORS), anchors);
   if (o.contact_room < 0 || o.contact_room > 1 << 20)
     return refuse(m, ECHOSPLINE_WRONG_SIZE, "contact_room must be 0 to %d; got %lld", 1 << 20,
                   static_cast<long long>(o.contact_room));
@@ -230,6 +240,7 @@ void echospline_scene_defaults(echospline_scene_options* o) {
   o->clamped = ECHOSPLINE_LEFT | ECHOSPLINE_RIGHT | ECHOSPLINE_BOTTOM;
   if (dimension == 3) o->clamped |= ECHOSPLINE_FRONT | ECHOSPLINE_BACK;
   o->sigma = 1, o->delta = 1.5, o->alpha1 = 0.08, o->alpha2 = 0.04, o->alpha3 = 1, o->length = 1, o->drag = 1;
+  o->loading = ECHOSPLINE_STICK, o->friction_speed = 10;
   o->contact_spacing = 1.25, o->anchor_spacing = dimension == 2 ? 1.5 : 5;
   o->poisson = 0.45, o->radius = 1;
 }

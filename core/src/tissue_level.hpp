@@ -174,7 +174,7 @@ struct Kind {
     std::memcpy(&sum, p + size - sizeof sum, sizeof sum);
     if (sum != checksum(bytes, size - static_cast<int64_t>(sizeof sum))) return refuse(message, "these are damaged");
     if (header.dimension != D || header.fingerprint != own.scene.fingerprint)
-      return refuse(message, "these belong to a scene with another mesh, clamped edges or parameters");
+      return refuse(message, "these belong to a scene with another mesh, clamped or sliding edges, or parameters");
     if (!finite(header.place) || !finite(header.q) || !finite(header.entry) || !finite(header.tip_at) ||
         header.tip < 0 || header.tip > 2)
       return refuse(message, "a number in these is out of its range");
@@ -242,7 +242,9 @@ struct Kind {
   }
   template <class Real>
   static typename SceneOf::FieldFor field_for(const echospline_scene_options& o) {
-    return o.kernel == ECHOSPLINE_THIN_PLATE ? create_field<D, ThinPlate<D>, Real> : create_field<D, Elastic<D>, Real>;
+    return o.kernel == ECHOSPLINE_ELASTIC ? create_field<D, Elastic<D>, Real>
+           : o.sliding                    ? create_field<D, PlatesApart<D>, Real>
+                                          : create_field<D, ThinPlate<D>, Real>;
   }
 
   static echospline_status create_scene(const echospline_scene_options& o, void** out, const SceneFunctions** functions,
@@ -253,7 +255,12 @@ struct Kind {
     if (!made) return ECHOSPLINE_OUT_OF_MEMORY;
     for (int d = 0; d < D; ++d) {
       made->grid.shape[d] = o.shape[d], made->grid.spacing[d] = o.spacing[d], made->grid.origin[d] = o.origin[d];
-      made->clamps.low[d] = (o.clamped >> (2 * d) & 1) != 0, made->clamps.high[d] = (o.clamped >> (2 * d + 1) & 1) != 0;
+      for (int side = 0; side < 2; ++side) {
+        const int bit = 2 * d + side;
+        made->clamps.edge[d][side] = o.clamped >> bit & 1   ? Edge::clamped
+                                     : o.sliding >> bit & 1 ? Edge::sliding
+                                                            : Edge::free;
+      }
     }
     bool there = made->clamps.points.reserve(o.clamped_point_count) &&
                  made->stiffness.reserve(o.stiffness ? made->grid.size() : 0);
@@ -267,12 +274,16 @@ struct Kind {
                          o.alpha3,
                          o.length,
                          o.drag,
+                         o.friction_speed,
                          o.loading == ECHOSPLINE_IMMEDIATE,
+                         o.loading == ECHOSPLINE_STICK,
                          o.tip == ECHOSPLINE_TIP_NODE};
     made->contact_room = o.contact_room > 0 ? o.contact_room : FIRST_ROOM;
     made->fingerprint = fingerprint(o);
     const auto kernel = [&](double scale) {
-      return o.kernel == ECHOSPLINE_THIN_PLATE ? kernel_for<ThinPlate<D>>(o, scale) : kernel_for<Elastic<D>>(o, scale);
+      return o.kernel == ECHOSPLINE_ELASTIC ? kernel_for<Elastic<D>>(o, scale)
+             : o.sliding                    ? kernel_for<PlatesApart<D>>(o, scale)
+                                            : kernel_for<ThinPlate<D>>(o, scale);
     };
     const typename SceneOf::Outcome outcome =
         there ? made->build(o.contact_spacing, o.anchor_spacing, kernel, make_field) : SceneOf::no_memory;
@@ -280,25 +291,34 @@ struct Kind {
       *out = made, *functions = &scene_functions;
       return ECHOSPLINE_OK;
     }
-    const int64_t count = made->anchored.anchors;
+    const AnchoredKernel<D>& anchored = made->anchored;
+    const int64_t count = outcome == SceneOf::not_held ? anchored.held_by(anchored.loose) : 0;
+    const char* flat = D == 2 ? "line" : "plane";
+    if (anchored.systems > 1)
+      std::snprintf(
+          message.text, sizeof message.text,
+          "what is held must determine the field; along %c the %lld anchors lie on one %s or are too few: clamp "
+          "an edge, or let one that is normal to %c slide",
+          "xyz"[anchored.loose], static_cast<long long>(count), flat, "xyz"[anchored.loose]);
+    else
+      std::snprintf(message.text, sizeof message.text,
+                    "the %lld anchors along what is held must determine the field; they lie on one %s or are too few: "
+                    "clamp another edge",
+                    static_cast<long long>(anchored.anchors), flat);
     destroy(made);
-    if (outcome == SceneOf::no_memory) return ECHOSPLINE_OUT_OF_MEMORY;
-    std::snprintf(message.text, sizeof message.text,
-                  "the %lld anchors along what is clamped must determine the field; they lie on one %s or are too few: "
-                  "clamp another edge",
-                  static_cast<long long>(count), D == 2 ? "line" : "plane");
-    return ECHOSPLINE_NOT_HELD;
+    return outcome == SceneOf::no_memory ? ECHOSPLINE_OUT_OF_MEMORY : ECHOSPLINE_NOT_HELD;
   }
   /// Of everything that a state depends on.
   static uint64_t fingerprint(const echospline_scene_options& o) {
     const int32_t choices[] = {o.dimension, o.kernel, o.tip, o.loading, o.plane, static_cast<int32_t>(o.clamped)};
     const double numbers[] = {o.sigma, o.delta,           o.alpha1,         o.alpha2,  o.alpha3, o.length,
-                              o.drag,  o.contact_spacing, o.anchor_spacing, o.poisson, o.radius};
+                              o.drag,  o.contact_spacing, o.anchor_spacing, o.poisson, o.radius, o.friction_speed};
     uint64_t sum = checksum(choices, sizeof choices);
     sum = checksum(numbers, sizeof numbers, sum);
     sum = checksum(o.shape, D * static_cast<int64_t>(sizeof *o.shape), sum);
     sum = checksum(o.spacing, D * static_cast<int64_t>(sizeof *o.spacing), sum);
     sum = checksum(o.origin, D * static_cast<int64_t>(sizeof *o.origin), sum);
+    if (o.sliding) sum = checksum(&o.sliding, sizeof o.sliding, sum);
     sum = checksum(o.clamped_points, o.clamped_point_count * D * static_cast<int64_t>(sizeof(double)), sum);
     return checksum(o.stiffness, o.stiffness_count * static_cast<int64_t>(sizeof(double)), sum);
   }

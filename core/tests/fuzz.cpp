@@ -59,10 +59,11 @@ class Session {
   ~Session() {
     leave();
     echospline_picture_destroy(picture_);
+    echospline_forced_destroy(forced_);
   }
 
   void act() {
-    switch (choices_.below(38)) {
+    switch (choices_.below(56)) {
       case 0: open(); break;
       case 1: reset(); break;
       case 2:
@@ -85,6 +86,20 @@ class Session {
       case 19:
       case 20:
       case 21: draw(); break;
+      case 38:
+      case 39: open_forced(); break;
+      case 40: save_forced(); break;
+      case 41:
+      case 42: load_forced(); break;
+      case 43: read_forced(); break;
+      case 44: answer_forced(); break;
+      case 45:
+      case 46:
+      case 47:
+      case 48:
+      case 49:
+      case 50:
+      case 51: advance_forced(); break;
       default: advance(); break;
     }
   }
@@ -94,7 +109,7 @@ class Session {
   echospline_tissue* tissue() { return given() ? tissue_ : nullptr; }
 
   void known(echospline_status status, const char* message, bool has_handle) {
-    require(status >= ECHOSPLINE_OK && status <= ECHOSPLINE_FAILED_HANDLE, "a status that the header does not know");
+    require(status >= ECHOSPLINE_OK && status <= ECHOSPLINE_NEEDS_STATION, "a status that the header does not know");
     require(std::strcmp(echospline_status_text(status), "unknown status") != 0, "a status without a name");
     if (status != ECHOSPLINE_OK && has_handle) require(message && *message, "a failure without a message");
   }
@@ -116,9 +131,10 @@ class Session {
     o.kernel = choices_.whole(0, 1);
     o.precision = choices_.whole(0, 1);
     o.tip = choices_.whole(0, 1);
-    o.loading = choices_.whole(0, 1);
+    o.loading = choices_.whole(0, 2);
     o.plane = choices_.whole(0, 1);
     if (choices_.below(4) == 0) o.clamped = choices_.byte();
+    if (choices_.below(4) == 0) o.sliding = choices_.byte() & (choices_.below(4) ? ~o.clamped : ~0u);
     o.level = choices_.below(4) == 0 ? choices_.whole(0, 5) : ECHOSPLINE_LEVEL_BEST;
     const int32_t most = o.dimension == 3 ? 6 : 17;
     for (int k = 0; k < 3; ++k) {
@@ -128,7 +144,7 @@ class Session {
     }
     o.anchor_spacing = choices_.number(2, 9);
     double* numbers[] = {&o.sigma,  &o.delta, &o.alpha1,          &o.alpha2, &o.alpha3,
-                         &o.length, &o.drag,  &o.contact_spacing, &o.radius};
+                         &o.length, &o.drag,  &o.contact_spacing, &o.radius, &o.friction_speed};
     for (double* number : numbers)
       if (choices_.below(8) == 0) *number = choices_.number(0, 2);
     if (choices_.below(8) == 0) o.poisson = choices_.number(0, 0.5);
@@ -285,6 +301,112 @@ class Session {
           false);
   }
 
+  echospline_forced* forced() { return given() ? forced_ : nullptr; }
+  echospline_status of_forced(echospline_forced* forced, echospline_status status) {
+    known(status, echospline_forced_message(forced), forced != nullptr);
+    if (!forced) require(status != ECHOSPLINE_OK, "NULL was taken for a forced tissue");
+    return status;
+  }
+
+  void open_forced() {
+    echospline_forced_destroy(forced_);
+    forced_ = nullptr, forced_nodes_ = 0;
+    echospline_forced_options o;
+    std::memset(&o, 0, sizeof o);
+    o.struct_size = sizeof o;
+    echospline_forced_defaults(&o);
+    if (choices_.rarely()) o.struct_size = choices_.byte();
+    o.level = choices_.below(4) == 0 ? choices_.whole(0, 5) : ECHOSPLINE_LEVEL_BEST;
+    o.node_count = choices_.size(choices_.whole(1, 30));
+    for (int k = 0; k < 2; ++k) o.low[k] = choices_.number(-5, 5), o.high[k] = o.low[k] + choices_.number(5, 30);
+    double* numbers[] = {&o.tip,       &o.friction_limit,  &o.bond,    &o.tip_stiffness, &o.side_stiffness,
+                         &o.viscosity, &o.station_spacing, &o.substep, &o.dead_band};
+    for (double* number : numbers)
+      if (choices_.below(8) == 0) *number = choices_.number(0, 2);
+    const echospline_status status = echospline_forced_create(given() ? &o : nullptr, given() ? &forced_ : nullptr);
+    known(status, echospline_forced_message(forced_), forced_ != nullptr);
+    if (status == ECHOSPLINE_OK) forced_nodes_ = o.node_count < 100 ? o.node_count : 0;
+    for (int k = 0; k < 2; ++k) forced_low_[k] = o.low[k], forced_size_[k] = o.high[k] - o.low[k];
+  }
+
+  /// Answer what is wanted: mostly by a compliance, else by any numbers.
+  bool answer_forced() {
+    echospline_station station;
+    std::memset(&station, 0, sizeof station);
+    echospline_forced* f = forced();
+    if (of_forced(f, echospline_forced_wanted(f, given() ? &station : nullptr)) != ECHOSPLINE_OK) return false;
+    require(station.index >= 0 && station.index < 1000 && station.point_count >= 0 && station.point_count <= 4,
+            "a wanted station that cannot be");
+    const bool wild = choices_.rarely();
+    std::vector<float> columns(4 * forced_nodes_);
+    std::vector<double> rows(4 * (station.index + 1));
+    for (float& u : columns) u = static_cast<float>(wild ? choices_.number(-5, 5) : 0.25);
+    for (size_t i = 0; i < rows.size(); ++i) {
+      const bool own = i + 4 >= rows.size();
+      rows[i] = wild ? choices_.number(-5, 5) : i % 4 == 1 || i % 4 == 2 ? 0.0 : own ? 2.0 : 0.5;
+    }
+    return of_forced(f, echospline_forced_answer(
+                            f, given() ? columns.data() : nullptr, choices_.size(int64_t(columns.size())),
+                            given() ? rows.data() : nullptr, choices_.size(int64_t(rows.size())))) == ECHOSPLINE_OK;
+  }
+
+  void advance_forced() {
+    if (choices_.below(4) == 0) forced_entry_ = forced_low_[0] + forced_size_[0] * choices_.number(0.2, 0.8);
+    echospline_pose pose;
+    std::memset(&pose, 0, sizeof pose);
+    pose.entry[0] = forced_entry_, pose.entry[1] = forced_low_[1] - choices_.below(2);
+    for (int k = 0; k < 2; ++k) pose.tip[k] = forced_low_[k] + forced_size_[k] * choices_.number(0.1, 1.1);
+    pose.dt = choices_.number(0, 0.1);
+    echospline_forced* f = forced();
+    for (int i = 0; i < 60; ++i) {
+      if (of_forced(f, echospline_forced_advance(f, given() ? &pose : nullptr)) != ECHOSPLINE_NEEDS_STATION) break;
+      if (!answer_forced()) break;
+    }
+    read_forced();
+  }
+
+  void read_forced() {
+    echospline_forced* f = forced();
+    echospline_needle_load load;
+    if (of_forced(f, echospline_forced_load(f, given() ? &load : nullptr)) == ECHOSPLINE_OK && f)
+      require(std::isfinite(load.tip) && std::isfinite(load.torque) && load.tip >= 0, "a force that is not finite");
+    std::vector<double> forces(2 * 40), field(2 * forced_nodes_);
+    int64_t count = 0;
+    of_forced(f, echospline_forced_forces(f, given() ? forces.data() : nullptr, choices_.below(41),
+                                          given() ? &count : nullptr));
+    require(count >= 0, "a negative number of forces");
+    std::vector<echospline_station> stations(choices_.below(8));
+    of_forced(f, echospline_forced_stations(f, given() ? stations.data() : nullptr, int64_t(stations.size()),
+                                            given() ? &count : nullptr));
+    if (of_forced(f, echospline_forced_displacement(f, given() ? field.data() : nullptr,
+                                                    choices_.size(int64_t(field.size())))) == ECHOSPLINE_OK)
+      for (double u : field) require(std::isfinite(u), "a displacement that is not finite");
+    if (choices_.rarely()) of_forced(f, echospline_forced_reset(f));
+  }
+
+  void save_forced() {
+    echospline_forced* f = forced();
+    const int64_t size = echospline_forced_state_size(f);
+    require(size >= 0 && size < (1 << 24), "the size of a state");
+    std::vector<uint8_t> bytes(size);
+    const int64_t room = choices_.size(size);
+    if (of_forced(f, echospline_forced_state_save(f, given() ? bytes.data() : nullptr, room)) == ECHOSPLINE_OK &&
+        size <= room)
+      forced_saved_ = bytes;
+  }
+
+  void load_forced() {
+    if (forced_saved_.empty()) return;
+    std::vector<uint8_t> bytes = forced_saved_;
+    for (int n = choices_.below(3); n > 0; --n)
+      bytes[(choices_.byte() * 256 + choices_.byte()) % bytes.size()] ^= 1 << choices_.below(8);
+    if (choices_.below(6) == 0) bytes.resize(bytes.size() * choices_.byte() / 256);
+    echospline_forced* f = forced();
+    of_forced(f, echospline_forced_state_load(f, given() ? bytes.data() : nullptr,
+                                              choices_.rarely() ? -1 : int64_t(bytes.size())));
+    read_forced();
+  }
+
   echospline_picture* picture() { return given() ? picture_ : nullptr; }
   echospline_status drawn(echospline_picture* picture, echospline_status status) {
     known(status, echospline_picture_message(picture), picture != nullptr);
@@ -422,6 +544,10 @@ class Session {
   Choices& choices_;
   echospline_scene* scene_ = nullptr;
   echospline_tissue* tissue_ = nullptr;
+  echospline_forced* forced_ = nullptr;
+  int64_t forced_nodes_ = 0;
+  double forced_low_[2] = {}, forced_size_[2] = {20, 20}, forced_entry_ = 5;
+  std::vector<uint8_t> forced_saved_;
   echospline_picture* picture_ = nullptr;
   int64_t mesh_nodes_ = 0, pixels_ = 0, bytes_ = 0;
   bool good_ = false;

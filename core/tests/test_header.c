@@ -17,6 +17,7 @@ VALUE(NOT_HELD, 5);
 VALUE(NOT_SOLVED, 6);
 VALUE(WRONG_STATE, 7);
 VALUE(FAILED_HANDLE, 8);
+VALUE(NEEDS_STATION, 9);
 VALUE(LEVEL_BEST, 0);
 VALUE(LEVEL_BASELINE, 1);
 VALUE(LEVEL_AVX2, 2);
@@ -31,6 +32,7 @@ VALUE(TIP_POINT, 0);
 VALUE(TIP_NODE, 1);
 VALUE(FOLLOW, 0);
 VALUE(IMMEDIATE, 1);
+VALUE(STICK, 2);
 VALUE(PLANE_STRESS, 0);
 VALUE(PLANE_STRAIN, 1);
 VALUE(LEFT, 1);
@@ -63,7 +65,7 @@ VALUE(SHADOW, 8);
 #define SIZE(type, size) static_assert(sizeof(type) == size, #type)
 #define OFFSET(type, member, offset) static_assert(offsetof(type, member) == offset, #type "." #member)
 
-SIZE(echospline_scene_options, 224);
+SIZE(echospline_scene_options, 240);
 OFFSET(echospline_scene_options, struct_size, 0);
 OFFSET(echospline_scene_options, dimension, 4);
 OFFSET(echospline_scene_options, kernel, 8);
@@ -92,6 +94,9 @@ OFFSET(echospline_scene_options, clamped_point_count, 192);
 OFFSET(echospline_scene_options, stiffness, 200);
 OFFSET(echospline_scene_options, stiffness_count, 208);
 OFFSET(echospline_scene_options, contact_room, 216);
+OFFSET(echospline_scene_options, sliding, 224);
+OFFSET(echospline_scene_options, reserved, 228);
+OFFSET(echospline_scene_options, friction_speed, 232);
 
 SIZE(echospline_pose, 64);
 OFFSET(echospline_pose, entry, 0);
@@ -182,6 +187,38 @@ OFFSET(echospline_picture_report, exact_share, 24);
 OFFSET(echospline_picture_report, folded_cells, 32);
 OFFSET(echospline_picture_report, smallest_jacobian, 40);
 OFFSET(echospline_picture_report, place, 48);
+
+SIZE(echospline_forced_options, 120);
+OFFSET(echospline_forced_options, struct_size, 0);
+OFFSET(echospline_forced_options, level, 4);
+OFFSET(echospline_forced_options, node_count, 8);
+OFFSET(echospline_forced_options, low, 16);
+OFFSET(echospline_forced_options, high, 32);
+OFFSET(echospline_forced_options, tip, 48);
+OFFSET(echospline_forced_options, friction_limit, 56);
+OFFSET(echospline_forced_options, bond, 64);
+OFFSET(echospline_forced_options, tip_stiffness, 72);
+OFFSET(echospline_forced_options, side_stiffness, 80);
+OFFSET(echospline_forced_options, viscosity, 88);
+OFFSET(echospline_forced_options, station_spacing, 96);
+OFFSET(echospline_forced_options, substep, 104);
+OFFSET(echospline_forced_options, dead_band, 112);
+
+SIZE(echospline_station, 144);
+OFFSET(echospline_station, index, 0);
+OFFSET(echospline_station, place, 8);
+OFFSET(echospline_station, axis, 24);
+OFFSET(echospline_station, points, 40);
+OFFSET(echospline_station, weights, 104);
+OFFSET(echospline_station, point_count, 136);
+OFFSET(echospline_station, reserved, 140);
+
+SIZE(echospline_needle_load, 40);
+OFFSET(echospline_needle_load, tip, 0);
+OFFSET(echospline_needle_load, friction, 8);
+OFFSET(echospline_needle_load, side, 16);
+OFFSET(echospline_needle_load, torque, 24);
+OFFSET(echospline_needle_load, cut, 32);
 #endif
 
 int main(void) {

@@ -22,14 +22,21 @@ equation  content                                                           code
 Lengths are mm, times s, forces N, moduli kPa; points (x lateral, y depth); displacement is deformed minus reference.
 """
 
-from echospline.errors import EchosplineError, FoldingError, InputError, MissingExtraError, SolverError
-from echospline.io import open_cine, open_writer, read, read_displacement, read_image, sample_image
-from echospline.mechanics import Elastic, FEMModel, NeedleForces, ThinPlate, TPSModel, TPSParameters
-from echospline.mechanics.protocol import TissueModel
-from echospline.picture import Deformation, Frame, NeedleEcho, simulate, warp
-from echospline.scenario import Scenario
-from echospline.scenario import load as load_scenario
-from echospline.scene import Cine, Insertion, NeedlePose, RegularGrid, Tissue, UltrasoundImage
+from typing import TYPE_CHECKING
+
+from echospline.menu import on_demand
+
+if TYPE_CHECKING:  # the menu, loaded on demand
+    from echospline.errors import EchosplineError, FoldingError, InputError, MissingExtraError, SolverError
+    from echospline.io import open_cine, open_writer, read, read_displacement, read_image, sample_image
+    from echospline.mechanics import Elastic, FEMModel, NeedleForces, ThinPlate, TPSModel, TPSParameters
+    from echospline.mechanics.protocol import TissueModel
+    from echospline.picture import Deformation, Frame, NeedleEcho, simulate, warp
+    from echospline.scenario import Scenario
+    from echospline.scenario import load as load_scenario
+    from echospline.scene import Cine, Insertion, NeedlePose, RegularGrid, Tissue, UltrasoundImage
+else:
+    on_demand(__name__)
 
 __all__ = [
     "Cine",

@@ -10,7 +10,7 @@ import pytest
 from threadpoolctl import threadpool_limits
 from tissues import FACES, Box, Pose, Session, given, handling
 
-from echospline.errors import SolverError
+from echospline.errors import InputError, SolverError
 
 DT = 1 / 15
 WITHIN = {"double": 1e-7, "single": 1e-5}  # mm
@@ -40,7 +40,9 @@ def assert_same_landmarks(state, session, within):
 
 
 CASES = list(
-    product((2, 3), ("thin plate", "elastic"), ("follow", "immediate"), ("point", "node"), (False, True))
+    product(
+        (2, 3), ("thin plate", "elastic"), ("stick", "follow", "immediate"), ("point", "node"), (False, True)
+    )
 )
 
 
@@ -112,17 +114,79 @@ def test_anchors_and_sources_are_those_of_the_plain_reading(dimension):
         chosen = replace(scene.parameters, contact_spacing=spacing, anchor_spacing=8.0 + case % 3)
         this = replace(scene, clamped=faces, points=points, parameters=chosen)
         oracle, session = this.oracle(), Session(this)
-        assert len(rows(oracle.anchors)) == len(oracle.anchors) == len(session.anchors())
-        assert rows(session.anchors()) == rows(oracle.anchors)
+        assert len(rows(oracle.anchors.places)) == len(oracle.anchors.places) == len(session.anchors())
+        assert rows(session.anchors()) == rows(oracle.anchors.places)
         assert session.sources().tolist() == oracle.lattice.tolist()
-    single = replace(scene, clamped=("bottom",))
-    if dimension == 2:
-        return
-    with pytest.raises(SolverError, match="lie on one plane"):
-        Session(single)
-    assert len(Session(replace(single, points=inside)).anchors()) == len(rows(single.oracle().anchors)) + len(
-        inside
+
+
+@pytest.mark.parametrize("kernel", ["thin plate", "elastic"])
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_one_edge_and_sliding_edges_have_the_anchors_of_the_plain_reading(dimension, kernel):
+    scene = given(dimension, kernel, anchor_spacing=8.0)
+    sides = ("left", "right", "top", "bottom", "front", "back")[: 2 * dimension]
+    inside = np.array([[7.3, 11.2, 6.1], [20.4, 8.7, 13.3]])[:, :dimension]
+    near = np.array([[7.3, 28.0, 6.1]])[:, :dimension]
+    cases = [((side,), ()) for side in sides]
+    cases += [(("bottom",), tuple(s for s in sides if s != "bottom"))]
+    cases += [(("bottom",), ("top",)), ((), ("left", "top", "front")[:dimension]), ((), sides)]
+    for faces, sliding in cases:
+        for points in (None, inside, near):
+            this = replace(scene, clamped=faces, sliding=sliding, points=points)
+            oracle, session = this.oracle(), Session(this)
+            assert rows(session.anchors()) == rows(oracle.anchors.places)
+            assert len(session.anchors()) == len(oracle.anchors)
+            assert session.sources().tolist() == oracle.lattice.tolist()
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_what_leaves_a_thin_plate_free_is_refused_with_the_direction(dimension):
+    scene = given(dimension, "thin plate")
+    sliding = ("top", "bottom", "front")[:dimension]
+    loose = replace(
+        scene, sliding=sliding, points=np.array([[7.3, 11.2, 6.1], [20.4, 8.7, 13.3]])[:, :dimension]
     )
+    with pytest.raises(InputError, match="no edge holds the x direction"):
+        loose.oracle()
+    with pytest.raises(SolverError, match="along x the 2 anchors lie on one"):
+        Session(loose)
+    assert len(Session(replace(loose, kernel=given(dimension, "elastic").kernel)).anchors()) > 2
+
+
+SLIDING = {
+    2: [
+        (("left", "right", "bottom"), ("top",)),
+        (("bottom",), ()),
+        (("bottom",), ("left", "right", "top")),
+        ((), ("left", "top")),
+    ],
+    3: [(("bottom",), ("top", "left", "right", "front", "back")), ((), ("left", "top", "back"))],
+}
+
+
+@pytest.mark.parametrize("stiff", [False, True])
+@pytest.mark.parametrize("kernel", ["thin plate", "elastic"])
+@pytest.mark.parametrize(("dimension", "edges"), [(D, edges) for D in (2, 3) for edges in SLIDING[D]])
+def test_sliding_edges_give_the_numbers_of_algorithm_2(dimension, edges, kernel, stiff):
+    clamped, sliding = edges
+    scene = replace(given(dimension, kernel, stiff=stiff), clamped=clamped, sliding=sliding)
+    oracle = scene.oracle()
+    sessions = {precision: Session(scene, precision) for precision in WITHIN}
+    errors = dict.fromkeys(WITHIN, 0.0)
+    state, nodes = oracle.rest(), scene.grid.nodes
+    where = np.arange(0, len(nodes), 1 if dimension == 2 else 23)
+    for step, pose in enumerate(handling(2, scene.grid, DT)):
+        state = oracle.advance(state, pose, DT)
+        expected = None if dimension == 3 and step % 4 else oracle.displacement_at(state, nodes[where])
+        for precision, session in sessions.items():
+            session.advance(pose, DT)
+            assert_same_landmarks(state, session, WITHIN[precision])
+            assert session.statistics().held_back == state.held_back
+            if expected is not None:
+                error = np.abs(session.displacement_at(nodes[where]) - expected).max()
+                error = max(error, np.abs(session.displacement()[where] - expected).max())
+                errors[precision] = max(errors[precision], error)
+    for precision, within in WITHIN.items():
+        assert errors[precision] < within, errors
 
 
 @pytest.mark.parametrize("kernel", ["thin plate", "elastic"])
@@ -238,7 +302,7 @@ def test_every_side_of_a_box_can_be_clamped_alone_with_points():
         for pose in list(handling(8, scene.grid, DT))[:16]:
             state = oracle.advance(state, pose, DT)
             session.advance(pose, DT)
-        held = np.vstack([oracle.anchors, scene.grid.nodes[::101]])
+        held = np.vstack([oracle.anchors.places, scene.grid.nodes[::101]])
         np.testing.assert_allclose(
             session.displacement_at(held), oracle.displacement_at(state, held), rtol=0, atol=1e-7
         )

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from echospline import _native as core
-from echospline.mechanics import Clamps, Elastic, ThinPlate, TPSParameters
+from echospline.mechanics import Clamps, Elastic, ThinPlate, TPSParameters, anchors_for
 from echospline.mechanics.landmarks import contact_lattice, join_gap
 from echospline.mechanics.reference import Reference
 from echospline.scene import ZERO_LENGTH, Floats, RegularGrid
@@ -68,6 +68,7 @@ class Given:
     clamped: tuple[str, ...] = ()
     points: Any = None
     stiffness: Floats | None = None
+    sliding: tuple[str, ...] = ()
 
     @property
     def dimension(self) -> int:
@@ -75,12 +76,13 @@ class Given:
 
     @cached_property
     def clamps(self) -> Clamps:
-        return Clamps.of(self.grid, self.clamped or FACES[self.dimension], self.points)
+        clamped = self.clamped or (() if self.sliding else FACES[self.dimension])
+        return Clamps.of(self.grid, clamped, self.points, self.sliding)
 
     def oracle(self) -> Reference:
         p = self.parameters
         lattice = contact_lattice(self.clamps, p.contact_spacing)
-        anchors = self.clamps.anchors(p.anchor_spacing)
+        anchors = anchors_for(self.clamps, self.kernel, p.anchor_spacing)
         gap = join_gap(self.grid, lattice)
         return Reference(self.grid, p, self.kernel, self.clamps, anchors, lattice, gap, self.stiffness)
 
@@ -94,9 +96,10 @@ class Session:
         o.dimension, o.precision = self.dimension, core.Precision[precision.upper()]
         o.tip, o.loading = core.Tip[f"TIP_{p.tip.upper()}"], core.Loading[p.loading.upper()]
         o.clamped = sum(core.Edge[name.upper()] for name in given.clamps.edges)
+        o.sliding = sum(core.Edge[name.upper()] for name in given.clamps.sliding)
         for name in ("shape", "spacing", "origin"):
             getattr(o, name)[: self.dimension] = getattr(given.grid, name)
-        for name in ("sigma", "delta", "alpha1", "alpha2", "alpha3", "length", "drag"):
+        for name in ("sigma", "delta", "alpha1", "alpha2", "alpha3", "length", "drag", "friction_speed"):
             setattr(o, name, getattr(p, name))
         o.contact_spacing, o.anchor_spacing = p.contact_spacing, p.anchor_spacing
         solid = given.kernel if isinstance(given.kernel, Elastic) else Elastic()

@@ -5,6 +5,8 @@
 //   peer send HOST PORT FILE...     connects, sends the files' bytes, then prints what comes back until the end
 //   peer ask HOST PORT TYPE         sends an empty TYPE (GET_STATUS ...) and prints the first answer that is no stream
 //   peer serve PORT FILE...         waits for one client, sends it the files' bytes, prints what it sends
+//   peer follow HOST PORT KIND N    sends STT_TDATA or STT_QTDATA (20 ms), prints N answers, sends STP_, prints what follows
+//                                   up to the answer to STP_
 //
 // g++ peer.cxx -I/usr/include/openigtlink -lOpenIGTLink -lpthread -o peer
 
@@ -26,7 +28,9 @@
 #include "igtlPositionMessage.h"
 #include "igtlServerSocket.h"
 #include "igtlStatusMessage.h"
+#include "igtlQuaternionTrackingDataMessage.h"
 #include "igtlStringMessage.h"
+#include "igtlTrackingDataMessage.h"
 #include "igtlTransformMessage.h"
 
 static void write(const std::string &folder, const std::string &name, igtl::MessageBase *m) {
@@ -42,15 +46,6 @@ static int golden(const std::string &folder) {
   igtl::TransformMessage::Pointer transform = igtl::TransformMessage::New();
   transform->SetMatrix(matrix);
   write(folder, "NeedleToReference", transform);
-
-  igtl::PositionMessage::Pointer position = igtl::PositionMessage::New();
-  position->SetPosition(1.5f, -2.5f, 3.5f);
-  position->SetQuaternion(0.5f, -0.5f, 0.5f, 0.5f);
-  write(folder, "Position7", position);
-  position->SetPackType(igtl::PositionMessage::WITH_QUATERNION3);
-  write(folder, "Position6", position);
-  position->SetPackType(igtl::PositionMessage::POSITION_ONLY);
-  write(folder, "Position3", position);
 
   // 5 columns, 3 rows, 2 slices; spacing 0.2, 0.3, 2 mm; the axes are not those of space
   igtl::ImageMessage::Pointer image = igtl::ImageMessage::New();
@@ -155,10 +150,53 @@ static int golden(const std::string &folder) {
   array->SetArray(igtl::NDArrayMessage::TYPE_FLOAT64, &numbers);
   write(folder, "NDArray", array);
 
+  igtl::TrackingDataMessage::Pointer tools = igtl::TrackingDataMessage::New();
+  igtl::TrackingDataElement::Pointer needle = igtl::TrackingDataElement::New(), probe = igtl::TrackingDataElement::New();
+  needle->SetName("NeedleTipToReference");
+  needle->SetType(igtl::TrackingDataElement::TYPE_6D);
+  needle->SetMatrix(matrix);
+  probe->SetName("Probe");
+  probe->SetType(igtl::TrackingDataElement::TYPE_5D);
+  igtl::Matrix4x4 other = {{1, 0, 0, 100}, {0, 0, -1, 200}, {0, 1, 0, -300}, {0, 0, 0, 1}};
+  probe->SetMatrix(other);
+  tools->AddTrackingDataElement(needle);
+  tools->AddTrackingDataElement(probe);
+  write(folder, "TrackingData", tools);
+
+  igtl::QuaternionTrackingDataMessage::Pointer turned = igtl::QuaternionTrackingDataMessage::New();
+  igtl::QuaternionTrackingDataElement::Pointer stylus = igtl::QuaternionTrackingDataElement::New();
+  stylus->SetName("StylusToTracker");
+  stylus->SetType(igtl::QuaternionTrackingDataElement::TYPE_6D);
+  stylus->SetPosition(1.5f, -2.5f, 300.5f);
+  stylus->SetQuaternion(0.5f, -0.5f, 0.5f, 0.5f);
+  turned->AddQuaternionTrackingDataElement(stylus);
+  write(folder, "QuaternionData", turned);
+
+  igtl::StartTrackingDataMessage::Pointer start = igtl::StartTrackingDataMessage::New();
+  start->SetResolution(50);
+  start->SetCoordinateName("Tracker");
+  write(folder, "StartTracking", start);
+  igtl::StopTrackingDataMessage::Pointer stop = igtl::StopTrackingDataMessage::New();
+  write(folder, "StopTracking", stop);
+  igtl::RTSTrackingDataMessage::Pointer started = igtl::RTSTrackingDataMessage::New();
+  started->SetStatus(igtl::RTSTrackingDataMessage::STATUS_SUCCESS);
+  write(folder, "StartedTracking", started);
+
   igtl::GetStatusMessage::Pointer question = igtl::GetStatusMessage::New();
   write(folder, "GetStatus", question);
   igtl::GetCapabilityMessage::Pointer abilities = igtl::GetCapabilityMessage::New();
   write(folder, "GetCapability", abilities);
+
+  // last, because the library writes beyond the shorter ones
+  const int lengths[3] = {igtl::PositionMessage::ALL, igtl::PositionMessage::WITH_QUATERNION3, igtl::PositionMessage::POSITION_ONLY};
+  const char *names[3] = {"Position7", "Position6", "Position3"};
+  for (int i = 0; i < 3; ++i) {
+    igtl::PositionMessage::Pointer position = igtl::PositionMessage::New();
+    position->SetPackType(lengths[i]);
+    position->SetPosition(1.5f, -2.5f, 3.5f);
+    position->SetQuaternion(0.5f, -0.5f, 0.5f, 0.5f);
+    write(folder, names[i], position);
+  }
   return 0;
 }
 
@@ -261,6 +299,39 @@ static bool receive(igtl::Socket *socket, std::string *kind = 0) {
     for (int i = 0; ok && i < m->GetNumberOfAttributes(); ++i)
       std::printf("%s\"%s\"", i ? ", " : "", m->GetAttribute(i)->GetName());
     std::printf("]");
+  } else if (type == "TDATA") {
+    igtl::TrackingDataMessage::Pointer m = body<igtl::TrackingDataMessage>(socket, header, ok);
+    std::printf("\"tools\": [");
+    for (int i = 0; ok && i < m->GetNumberOfTrackingDataElements(); ++i) {
+      igtl::TrackingDataElement::Pointer tool;
+      igtl::Matrix4x4 matrix;
+      m->GetTrackingDataElement(i, tool);
+      tool->GetMatrix(matrix);
+      std::printf("%s{\"name\": \"%s\", \"kind\": %d, \"matrix\": ", i ? ", " : "", tool->GetName(), tool->GetType());
+      print(matrix);
+      std::printf("}");
+    }
+    std::printf("]");
+  } else if (type == "QTDATA") {
+    igtl::QuaternionTrackingDataMessage::Pointer m = body<igtl::QuaternionTrackingDataMessage>(socket, header, ok);
+    std::printf("\"tools\": [");
+    for (int i = 0; ok && i < m->GetNumberOfQuaternionTrackingDataElements(); ++i) {
+      igtl::QuaternionTrackingDataElement::Pointer tool;
+      float p[3], q[4];
+      m->GetQuaternionTrackingDataElement(i, tool);
+      tool->GetPosition(p);
+      tool->GetQuaternion(q);
+      std::printf("%s{\"name\": \"%s\", \"kind\": %d, \"position\": [%.9g, %.9g, %.9g], "
+                  "\"quaternion\": [%.9g, %.9g, %.9g, %.9g]}", i ? ", " : "", tool->GetName(), tool->GetType(), p[0],
+                  p[1], p[2], q[0], q[1], q[2], q[3]);
+    }
+    std::printf("]");
+  } else if (type == "RTS_TDATA") {
+    igtl::RTSTrackingDataMessage::Pointer m = body<igtl::RTSTrackingDataMessage>(socket, header, ok);
+    std::printf("\"status\": %d", m->GetStatus());
+  } else if (type == "RTS_QTDATA") {
+    igtl::RTSQuaternionTrackingDataMessage::Pointer m = body<igtl::RTSQuaternionTrackingDataMessage>(socket, header, ok);
+    std::printf("\"status\": %d", m->GetStatus());
   } else if (type == "NDARRAY") {
     igtl::NDArrayMessage::Pointer m = body<igtl::NDArrayMessage>(socket, header, ok);
     std::printf("\"scalar\": %d, \"axes\": %d", m->GetType(), m->GetArray()->GetDimension());
@@ -302,6 +373,28 @@ int main(int argc, char **argv) {
   } else if (mode == "send") {
     send(socket, argc, argv, 4);
     while (receive(socket)) {}
+  } else if (mode == "follow") {
+    std::string type = argv[4], kind;
+    igtl::MessageBase::Pointer start, stop;
+    if (type == "TDATA") {
+      igtl::StartTrackingDataMessage::Pointer m = igtl::StartTrackingDataMessage::New();
+      m->SetResolution(20);
+      start = m;
+      stop = igtl::StopTrackingDataMessage::New();
+    } else {
+      igtl::StartQuaternionTrackingDataMessage::Pointer m = igtl::StartQuaternionTrackingDataMessage::New();
+      m->SetResolution(20);
+      start = m;
+      stop = igtl::StopQuaternionTrackingDataMessage::New();
+    }
+    start->SetDeviceName("peer");
+    start->Pack();
+    socket->Send(start->GetPackPointer(), start->GetPackSize());
+    for (int i = 0; i < std::atoi(argv[5]) && receive(socket, &kind);) i += kind == type;
+    stop->SetDeviceName("peer");
+    stop->Pack();
+    socket->Send(stop->GetPackPointer(), stop->GetPackSize());
+    while (receive(socket, &kind) && kind != "RTS_" + type) {}
   } else if (mode == "ask") {
     igtl::MessageBase::Pointer question;
     std::string type = argv[4];

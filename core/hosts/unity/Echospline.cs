@@ -11,7 +11,7 @@ namespace Echospline
     public enum Status
     {
         Ok = 0, NullPointer = 1, WrongSize = 2, WrongValue = 3, OutOfMemory = 4, NotHeld = 5, NotSolved = 6, WrongState = 7,
-        FailedHandle = 8
+        FailedHandle = 8, NeedsStation = 9
     }
 
     public enum Level { LevelBest = 0, LevelBaseline = 1, LevelAvx2 = 2, LevelAvx512 = 3, LevelNeon = 4, LevelSimd128 = 5 }
@@ -22,7 +22,7 @@ namespace Echospline
 
     public enum Tip { TipPoint = 0, TipNode = 1 }
 
-    public enum Loading { Follow = 0, Immediate = 1 }
+    public enum Loading { Follow = 0, Immediate = 1, Stick = 2 }
 
     public enum Plane { PlaneStress = 0, PlaneStrain = 1 }
 
@@ -107,6 +107,9 @@ namespace Echospline
         public IntPtr Stiffness;
         public long StiffnessCount;
         public long ContactRoom;
+        public Edge Sliding;
+        public uint Reserved;
+        public double FrictionSpeed;
 
         /// <summary>The core's own defaults; shape and spacing have to be set.</summary>
         public static SceneOptions Defaults()
@@ -394,6 +397,163 @@ namespace Echospline
         }
     }
 
+    /// <summary>echospline_forced_options; begin with ForcedOptions.Defaults().</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct ForcedOptions
+    {
+        public uint StructSize;
+        public Level Level;
+        public long NodeCount;
+        public Point2 Low, High;
+        public double Tip;
+        public double FrictionLimit;
+        public double Bond;
+        public double TipStiffness;
+        public double SideStiffness;
+        public double Viscosity;
+        public double StationSpacing;
+        public double Substep;
+        public double DeadBand;
+
+        /// <summary>The core's own defaults; node count and corners have to be set.</summary>
+        public static ForcedOptions Defaults()
+        {
+            var options = new ForcedOptions { StructSize = (uint)Marshal.SizeOf(typeof(ForcedOptions)) };
+            Native.echospline_forced_defaults(ref options);
+            return options;
+        }
+    }
+
+    /// <summary>echospline_station: where a station's force acts.</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct Station
+    {
+        public long Index;
+        public Point2 Place;
+        public Point2 Axis;
+        public Point2 First, Second, Third, Fourth;  // points
+        public double WeightOfFirst, WeightOfSecond, WeightOfThird, WeightOfFourth;
+        public int PointCount;
+        public int Reserved;
+    }
+
+    /// <summary>echospline_needle_load: the needle's forces, N and N mm, and the track cut so far, mm.</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct NeedleLoad
+    {
+        public double Tip, Friction, Side, Torque, Cut;
+    }
+
+    /// <summary>Tissue in the plane under a needle that sticks, slips and cuts; how it answers forces comes from outside.</summary>
+    public sealed class Forced : IDisposable
+    {
+        /// <summary>Displacement of the nodes by a unit force along x, then y (2, nodes, 2), and over the stations (index + 1, 2, 2), mm/N.</summary>
+        public delegate void Answer(ref Station wanted, Station[] before, out float[] columns, out double[] rows);
+
+        private readonly Answer answer;
+        private IntPtr handle;
+
+        public Forced(ForcedOptions options, Answer answer)
+        {
+            Core.RequireVersion();
+            this.answer = answer;
+            var status = Native.echospline_forced_create(ref options, out handle);
+            if (status == Status.Ok) return;
+            var message = Native.Text(Native.echospline_forced_message(handle));
+            Dispose();
+            throw new EchosplineException(status, message);
+        }
+
+        /// <summary>Back to rest.</summary>
+        public void Reset() { Check(Native.echospline_forced_reset(handle)); }
+
+        /// <summary>Advance by one step.</summary>
+        public void Advance(ref Pose pose)
+        {
+            Status status;
+            while ((status = Native.echospline_forced_advance(handle, ref pose)) == Status.NeedsStation) Supply();
+            Check(status);
+        }
+
+        /// <summary>The needle's forces: what a haptic device needs.</summary>
+        public NeedleLoad Load()
+        {
+            NeedleLoad load;
+            Check(Native.echospline_forced_load(handle, out load));
+            return load;
+        }
+
+        /// <summary>Force at every station, two numbers each, N.</summary>
+        public double[] Forces()
+        {
+            long count;
+            Check(Native.echospline_forced_forces(handle, null, 0, out count));
+            var forces = new double[2 * count];
+            Check(Native.echospline_forced_forces(handle, forces, count, out count));
+            return forces;
+        }
+
+        /// <summary>Stations that have been answered.</summary>
+        public Station[] Stations()
+        {
+            long count;
+            Check(Native.echospline_forced_stations(handle, null, 0, out count));
+            var stations = new Station[count];
+            Check(Native.echospline_forced_stations(handle, stations, count, out count));
+            return stations;
+        }
+
+        /// <summary>Write the displacement of the mesh nodes, two numbers each, mm.</summary>
+        public void Displacement(double[] field)
+        {
+            Status status;
+            while ((status = Native.echospline_forced_displacement(handle, field, field.LongLength)) == Status.NeedsStation) Supply();
+            Check(status);
+        }
+
+        /// <summary>The same in single precision.</summary>
+        public void Displacement(float[] field)
+        {
+            Status status;
+            while ((status = Native.echospline_forced_displacement_single(handle, field, field.LongLength)) == Status.NeedsStation) Supply();
+            Check(status);
+        }
+
+        /// <summary>The present state as bytes.</summary>
+        public byte[] Save()
+        {
+            var bytes = new byte[Native.echospline_forced_state_size(handle)];
+            Check(Native.echospline_forced_state_save(handle, bytes, bytes.LongLength));
+            return bytes;
+        }
+
+        /// <summary>Make saved bytes the present state.</summary>
+        public void Restore(byte[] bytes) { Check(Native.echospline_forced_state_load(handle, bytes, bytes.LongLength)); }
+
+        public void Dispose()
+        {
+            Native.echospline_forced_destroy(handle);
+            handle = IntPtr.Zero;
+        }
+
+        private void Supply()
+        {
+            Station wanted;
+            Check(Native.echospline_forced_wanted(handle, out wanted));
+            var before = Stations();
+            Array.Resize(ref before, (int)wanted.Index);
+            float[] columns;
+            double[] rows;
+            answer(ref wanted, before, out columns, out rows);
+            Check(Native.echospline_forced_answer(handle, columns, columns.LongLength, rows, rows.LongLength));
+        }
+
+        private void Check(Status status)
+        {
+            if (status != Status.Ok) throw new EchosplineException(status, Native.Text(Native.echospline_forced_message(handle)));
+        }
+    }
+
     /// <summary>A reference image, its deformation and a needle's echo. Pixels are (rows, columns, channels).</summary>
     public sealed class Picture : IDisposable
     {
@@ -559,5 +719,21 @@ namespace Echospline
         [DllImport(Library)] internal static extern Status echospline_picture_inverse(IntPtr picture, [Out] float[] x, [Out] float[] y, long count);
         [DllImport(Library)] internal static extern Status echospline_picture_check(IntPtr picture, ref PictureReport report);
         [DllImport(Library)] internal static extern Status echospline_picture_echo(IntPtr picture, ref Needle needle, double[] points, long point_count, [Out] double[] power, [Out] double[] transmission);
+        [DllImport(Library)] internal static extern void echospline_forced_defaults(ref ForcedOptions options);
+        [DllImport(Library)] internal static extern Status echospline_forced_create(ref ForcedOptions options, out IntPtr forced);
+        [DllImport(Library)] internal static extern void echospline_forced_destroy(IntPtr forced);
+        [DllImport(Library)] internal static extern IntPtr echospline_forced_message(IntPtr forced);
+        [DllImport(Library)] internal static extern Status echospline_forced_reset(IntPtr forced);
+        [DllImport(Library)] internal static extern Status echospline_forced_advance(IntPtr forced, ref Pose pose);
+        [DllImport(Library)] internal static extern Status echospline_forced_wanted(IntPtr forced, out Station station);
+        [DllImport(Library)] internal static extern Status echospline_forced_stations(IntPtr forced, [Out] Station[] stations, long room, out long count);
+        [DllImport(Library)] internal static extern Status echospline_forced_answer(IntPtr forced, float[] columns, long count, double[] rows, long row_count);
+        [DllImport(Library)] internal static extern Status echospline_forced_load(IntPtr forced, out NeedleLoad load);
+        [DllImport(Library)] internal static extern Status echospline_forced_forces(IntPtr forced, [Out] double[] forces, long room, out long count);
+        [DllImport(Library)] internal static extern Status echospline_forced_displacement(IntPtr forced, [Out] double[] displacement, long count);
+        [DllImport(Library)] internal static extern Status echospline_forced_displacement_single(IntPtr forced, [Out] float[] displacement, long count);
+        [DllImport(Library)] internal static extern long echospline_forced_state_size(IntPtr forced);
+        [DllImport(Library)] internal static extern Status echospline_forced_state_save(IntPtr forced, [Out] byte[] bytes, long size);
+        [DllImport(Library)] internal static extern Status echospline_forced_state_load(IntPtr forced, byte[] bytes, long size);
     }
 }

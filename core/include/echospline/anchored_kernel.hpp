@@ -9,6 +9,7 @@
 // kernel is taken less that of a neighbour, its parent (the nearest one before it); rows of [U P] and L_B are in these differences.
 #pragma once
 #include "array.hpp"
+#include "grid.hpp"
 #include "kernels.hpp"
 #include "lanes.hpp"
 
@@ -65,21 +66,38 @@ inline bool invert(double* A, int64_t n, int64_t ld, int64_t* pivots) {
   return true;
 }
 
-/// G of one set of anchors. Rows of [U P] have all anchors for the first component, then for the next, then the motions; the entry of an
-/// anchor is less that of its parent.
+/// Anchors that hold one component of the displacement.
+template <int D>
+struct AnchorRow {
+  int64_t count = 0;
+  int64_t first = 0;       ///< where its entries begin in a row of [U P]
+  Array<int32_t> anchor;   ///< (count)
+  Array<int32_t> parent;   ///< of every one, before it in this row; -1 for the first
+  Array<double> place[D];  ///< conditioned, (count rounded up to ROW)
+
+  Vec<D> at(int64_t i) const {
+    Vec<D> p;
+    for (int d = 0; d < D; ++d) p[d] = place[d][i];
+    return p;
+  }
+};
+
+/// G of one set of anchors. Each holds all components of the displacement or some. Rows of [U P] have the anchors of the first component, then
+/// those of the next, then the motions; the entry of an anchor is less that of its parent. Where the components are apart, each has a
+/// system of its own, and the row of a component has its own anchors and motions alone.
 template <int D>
 struct AnchoredKernel {
   KernelOf<D> kernel;      ///< in conditioned coordinates (x - centre) / scale
   int c = 1;               ///< components of the kernel
+  int systems = 1;         ///< c where the components are apart
   Vec<D> centre;           ///< mm
   double scale = 1;        ///< mm
   int64_t anchors = 0;     ///< b
-  int64_t order = 0;       ///< m = b c + motions
-  int64_t ld = 0;          ///< m rounded up to ROW
-  int64_t padded = 0;      ///< b rounded up to ROW
-  Array<double> place[D];  ///< conditioned anchors, (padded)
-  Array<int32_t> parent;   ///< of every anchor, before it; -1 for the first
-  Array<double> inverse;   ///< L_B^-1, (m, ld)
+  int64_t ld = 0;          ///< numbers in the longest row, rounded up to ROW
+  Array<double> place[D];  ///< conditioned anchors, (b)
+  AnchorRow<D> row[D];     ///< of every component
+  bool alike = true;       ///< all anchors hold all components
+  Array<double> inverse;   ///< L_B^-1 of every system, (systems, length of the longest row, ld)
 
   Vec<D> conditioned(const Vec<D>& p) const { return (1 / scale) * (p - centre); }
   Vec<D> anchor(int64_t i) const {
@@ -87,6 +105,11 @@ struct AnchoredKernel {
     for (int d = 0; d < D; ++d) p[d] = place[d][i];
     return p;
   }
+  /// Entries of anchors in the row of a component, and with the motions.
+  int64_t held_by(int a) const { return systems > 1 ? row[a].count : row[c - 1].first + row[c - 1].count; }
+  int64_t order(int a) const { return held_by(a) + kernel.motions; }
+  /// Whether component e acts on component a.
+  bool acts(int e, int a) const { return systems == 1 || a == e; }
   /// What a spring of stiffness k adds to the diagonal, conditioned; 0 for an infinite one.
   double softness(double stiffness) const {
     double unit = kernel.per_spring / stiffness;
@@ -97,95 +120,132 @@ struct AnchoredKernel {
 
   /// Rows [U_xB P_x] of a conditioned point, (c, ld).
   void felt(const Vec<D>& x, double* out) const {
-    const double* places[D];
-    for (int d = 0; d < D; ++d) places[d] = place[d].data();
-    kernel.along(kernel, x, places, anchors, out, ld);
-    for (int a = 0; a < c; ++a)
-      for (int e = 0; e < c; ++e) {
-        double* entry = out + a * ld + e * anchors;
-        for (int64_t i = anchors; i-- > 1;) entry[i] -= entry[parent[i]];
+    for (int e = 0; e < c; ++e) {
+      const AnchorRow<D>& own = row[e];
+      const double* places[D];
+      for (int d = 0; d < D; ++d) places[d] = own.place[d].data();
+      kernel.along(kernel, e, x, places, own.count, out + own.first, ld);
+      for (int a = 0; a < c; ++a) {
+        if (!acts(e, a)) continue;
+        double* entry = out + a * ld + own.first;
+        for (int64_t i = own.count; i-- > 1;) entry[i] -= entry[own.parent[i]];
       }
-    kernel.motion(x, out + anchors * c, ld);
+    }
+    if (systems == 1)
+      kernel.motion(x, out + held_by(0), ld);
+    else
+      for (int a = 0; a < c; ++a) kernel.motion(x, out + a * ld + held_by(a), ld);
     for (int a = 0; a < c; ++a)
-      for (int64_t i = order; i < ld; ++i) out[a * ld + i] = 0;
+      for (int64_t i = order(a); i < ld; ++i) out[a * ld + i] = 0;
   }
   /// L_B^-1 of such rows, (c, ld).
   void held(const double* felt, double* out) const {
     for (int a = 0; a < c; ++a) {
-      for (int64_t i = 0; i < order; ++i) out[a * ld + i] = dot(inverse.data() + i * ld, felt + a * ld, ld);
-      for (int64_t i = order; i < ld; ++i) out[a * ld + i] = 0;
+      const double* own = inverse.data() + (systems > 1 ? a * longest_ * ld : 0);
+      for (int64_t i = 0; i < order(a); ++i) out[a * ld + i] = dot(own + i * ld, felt + a * ld, ld);
+      for (int64_t i = order(a); i < ld; ++i) out[a * ld + i] = 0;
     }
   }
   /// G between two conditioned points of which one's `felt` and the other's `held` are known.
   void green(const Vec<D>& x, const double* felt, const Vec<D>& y, const double* held, double (&G)[D][D]) const {
     kernel.at(kernel, x - y, G);
     for (int a = 0; a < c; ++a)
-      for (int e = 0; e < c; ++e) G[a][e] -= dot(felt + a * ld, held + e * ld, ld);
+      for (int e = 0; e < c; ++e)
+        if (acts(e, a)) G[a][e] -= dot(felt + a * ld, held + e * ld, ld);
   }
 
   enum Outcome { ready, no_memory, not_held };
-  /// Assemble and factor L_B for anchors in mm; `kernel_for(scale)` describes the kernel in coordinates divided by a scale.
+  /// Assemble and factor L_B; `kernel_for(scale)` describes the kernel in coordinates divided by a scale.
   template <class KernelFor>
-  Outcome build(const Vec<D>* points, int64_t count, KernelFor kernel_for) {
+  Outcome build(const Anchor<D>* given, int64_t count, KernelFor kernel_for) {
     anchors = count;
     double extent = 0;
     for (int d = 0; d < D; ++d) {
       double low = INFINITY, high = -INFINITY;
-      for (int64_t i = 0; i < count; ++i) low = smaller(low, points[i][d]), high = larger(high, points[i][d]);
+      for (int64_t i = 0; i < count; ++i) low = smaller(low, given[i].place[d]), high = larger(high, given[i].place[d]);
       centre[d] = count ? 0.5 * (low + high) : 0;
       extent = larger(extent, high - low);
     }
     scale = extent > 0 ? extent / 2 : 1;
     kernel = kernel_for(scale);
-    c = kernel.components, order = count * c + kernel.motions, ld = rounded_up(order, ROW),
-    padded = rounded_up(count, ROW);
+    c = kernel.components, systems = kernel.apart ? c : 1;
     for (int d = 0; d < D; ++d) {
-      if (!place[d].reserve(padded)) return no_memory;
-      for (int64_t i = 0; i < count; ++i) place[d][i] = conditioned(points[i])[d];
+      if (!place[d].reserve(count)) return no_memory;
+      for (int64_t i = 0; i < count; ++i) place[d][i] = conditioned(given[i].place)[d];
     }
+    for (int e = 0; e < c; ++e)
+      if (!build_row(given, e)) return no_memory;
+    for (int a = 0; a < c; ++a) longest_ = larger(longest_, order(a));
+    ld = rounded_up(longest_, ROW);
     Array<int64_t> pivots;
-    Array<double> row;
-    if (!inverse.reserve(order * ld) || !pivots.reserve(order) || !row.reserve(c * ld) || !find_parents(points))
+    Array<double> felt_rows;
+    if (!inverse.reserve(systems * longest_ * ld) || !pivots.reserve(longest_) || !felt_rows.reserve(c * ld))
       return no_memory;
+    int64_t at[D] = {};
     for (int64_t i = 0; i < count; ++i) {
-      felt(conditioned(points[i]), row.data());
+      felt(anchor(i), felt_rows.data());
       for (int a = 0; a < c; ++a) {
-        std::memcpy(inverse.data() + (a * count + i) * ld, row.data() + a * ld,
-                    static_cast<size_t>(order) * sizeof(double));
-        for (int j = 0; j < kernel.motions; ++j)
-          inverse[(count * c + j) * ld + a * count + i] = row[a * ld + count * c + j];
+        if (!holds(given[i], a)) continue;
+        double* L = system(a);
+        const int64_t n = held_by(a), entry = row[a].first + at[a]++;
+        std::memcpy(L + entry * ld, &felt_rows[a * ld], static_cast<size_t>(order(a)) * sizeof(double));
+        for (int j = 0; j < kernel.motions; ++j) L[(n + j) * ld + entry] = felt_rows[a * ld + n + j];
       }
     }
-    if (!motions_determined(row)) return not_held;
-    // rows as differences, too
-    for (int64_t a = 0; a < c; ++a)
-      for (int64_t i = count; i-- > 1;)
-        add(&inverse[(a * count + i) * ld], -1, &inverse[(a * count + parent[i]) * ld], ld);
-    for (int64_t j = count * c; j < order; ++j)
-      for (int64_t a = 0; a < c; ++a)
-        for (int64_t i = count; i-- > 1;) inverse[j * ld + a * count + i] -= inverse[j * ld + a * count + parent[i]];
-    return invert(inverse.data(), order, ld, pivots.data()) ? ready : not_held;
+    for (loose = 0; loose < systems; ++loose) {
+      const int first = systems > 1 ? loose : 0, beyond = systems > 1 ? loose + 1 : c;
+      double* L = system(loose);
+      if (!motions_determined(L, held_by(loose), felt_rows)) return not_held;
+      // rows as differences, too
+      for (int a = first; a < beyond; ++a) {
+        const AnchorRow<D>& own = row[a];
+        double* rows = L + own.first * ld;
+        for (int64_t i = own.count; i-- > 1;) add(rows + i * ld, -1, rows + own.parent[i] * ld, ld);
+        for (int64_t j = held_by(loose); j < order(loose); ++j)
+          for (int64_t i = own.count; i-- > 1;) L[j * ld + own.first + i] -= L[j * ld + own.first + own.parent[i]];
+      }
+      if (!invert(L, order(loose), ld, pivots.data())) return not_held;
+    }
+    return ready;
   }
+  int loose = 0;  ///< system that the anchors do not determine, after `not_held`
 
  private:
-  bool find_parents(const Vec<D>* points) {
-    if (!parent.reserve(anchors)) return false;
+  int64_t longest_ = 0;  ///< row
+
+  double* system(int a) { return inverse.data() + (systems > 1 ? a * longest_ * ld : 0); }
+  /// Whether an anchor holds a component; the only one of a scalar kernel stands for all.
+  bool holds(const Anchor<D>& given, int component) const { return c == 1 || given.held[component]; }
+  bool build_row(const Anchor<D>* given, int component) {
+    AnchorRow<D>& own = row[component];
+    int64_t count = 0;
+    for (int64_t i = 0; i < anchors; ++i) count += holds(given[i], component);
+    own.count = count, alike = alike && count == anchors;
+    own.first = systems > 1 || component == 0 ? 0 : row[component - 1].first + row[component - 1].count;
+    if (!own.anchor.reserve(count) || !own.parent.reserve(count)) return false;
+    for (int d = 0; d < D; ++d)
+      if (!own.place[d].reserve(rounded_up(count, ROW))) return false;
+    count = 0;
     for (int64_t i = 0; i < anchors; ++i) {
-      parent[i] = -1;
+      if (!holds(given[i], component)) continue;
+      own.anchor[count] = static_cast<int32_t>(i), own.parent[count] = -1;
+      for (int d = 0; d < D; ++d) own.place[d][count] = place[d][i];
       double least = INFINITY;
-      for (int64_t j = 0; j < i; ++j)
-        if (dot(points[i] - points[j], points[i] - points[j]) < least)
-          least = dot(points[i] - points[j], points[i] - points[j]), parent[i] = static_cast<int32_t>(j);
+      for (int64_t j = 0; j < count; ++j) {
+        const Vec<D> gap = given[i].place - given[own.anchor[j]].place;
+        if (dot(gap, gap) < least) least = dot(gap, gap), own.parent[count] = static_cast<int32_t>(j);
+      }
+      ++count;
     }
     return true;
   }
-  /// Whether the anchors leave no motion free: the rows of R' are independent (Gram and Schmidt, largest first).
-  bool motions_determined(Array<double>& room) {
+  /// Whether n entries of anchors leave no motion free: the rows of R' are independent (Gram and Schmidt, largest first).
+  bool motions_determined(const double* L, int64_t n, Array<double>& room) const {
     const int p = kernel.motions;
-    const int64_t n = anchors * c, wide = rounded_up(n, ROW);
+    const int64_t wide = rounded_up(n, ROW);
     if (n < p || !room.reserve(p * wide)) return false;
     for (int j = 0; j < p; ++j)
-      for (int64_t i = 0; i < n; ++i) room[j * wide + i] = inverse[(n + j) * ld + i];
+      for (int64_t i = 0; i < n; ++i) room[j * wide + i] = L[(n + j) * ld + i];
     double first = 0;
     for (int j = 0; j < p; ++j) {
       int best = j;

@@ -3,7 +3,7 @@
  *
  * Scenes are read-only and shared by threads; one tissue, and one picture, belongs to one thread at a time.
  *
- * - A *scene* is what is given: mesh, clamped edges, parameters. It is factored once and never changes.
+ * - A *scene* is what is given: mesh, clamped and sliding edges, parameters. It is factored once and never changes.
  * - A *tissue* is one needle's session in a scene: the present state and the workspace that makes a step fast.
  *   States are values: `echospline_state_save` and `echospline_state_load` carry them as versioned bytes.
  * - A *picture* is a reference image, its deformation and the needle's echo.
@@ -48,10 +48,11 @@ enum {
   ECHOSPLINE_WRONG_SIZE = 2,    /* a struct_size, count or shape that does not fit */
   ECHOSPLINE_WRONG_VALUE = 3,   /* a number out of its range or not finite, an unknown choice */
   ECHOSPLINE_OUT_OF_MEMORY = 4, /* nothing has changed */
-  ECHOSPLINE_NOT_HELD = 5,      /* what is clamped does not determine the field */
+  ECHOSPLINE_NOT_HELD = 5,      /* what is held does not determine the field */
   ECHOSPLINE_NOT_SOLVED = 6,    /* landmarks cannot be told apart; the state has not changed */
   ECHOSPLINE_WRONG_STATE = 7,   /* bytes of another version or scene, or damaged */
-  ECHOSPLINE_FAILED_HANDLE = 8  /* the handle's create had failed: it only carries a message */
+  ECHOSPLINE_FAILED_HANDLE = 8, /* the handle's create had failed: it only carries a message */
+  ECHOSPLINE_NEEDS_STATION = 9  /* no failure: a forced tissue waits for the answer to a station */
 };
 
 /* Name of a status, for logs; never NULL. */
@@ -80,13 +81,13 @@ ECHOSPLINE_API const char* echospline_level_name(int32_t level);
 
 /* ---- Scene -------------------------------------------------------------------------------------------------------- */
 
-enum { ECHOSPLINE_THIN_PLATE = 0, ECHOSPLINE_ELASTIC = 1 };        /* kernel */
-enum { ECHOSPLINE_SINGLE = 0, ECHOSPLINE_DOUBLE = 1 };             /* precision of the field */
-enum { ECHOSPLINE_TIP_POINT = 0, ECHOSPLINE_TIP_NODE = 1 };        /* landmark of the tip */
-enum { ECHOSPLINE_FOLLOW = 0, ECHOSPLINE_IMMEDIATE = 1 };          /* loading */
-enum { ECHOSPLINE_PLANE_STRESS = 0, ECHOSPLINE_PLANE_STRAIN = 1 }; /* elastic kernel in the plane */
-enum {                                                             /* clamped edges (2-D) or faces (3-D), bits */
-       ECHOSPLINE_LEFT = 1,                                        /* least x */
+enum { ECHOSPLINE_THIN_PLATE = 0, ECHOSPLINE_ELASTIC = 1 };                     /* kernel */
+enum { ECHOSPLINE_SINGLE = 0, ECHOSPLINE_DOUBLE = 1 };                          /* precision of the field */
+enum { ECHOSPLINE_TIP_POINT = 0, ECHOSPLINE_TIP_NODE = 1 };                     /* landmark of the tip */
+enum { ECHOSPLINE_FOLLOW = 0, ECHOSPLINE_IMMEDIATE = 1, ECHOSPLINE_STICK = 2 }; /* loading */
+enum { ECHOSPLINE_PLANE_STRESS = 0, ECHOSPLINE_PLANE_STRAIN = 1 };              /* elastic kernel in the plane */
+enum {                                                                          /* edges (2-D) or faces (3-D), bits */
+       ECHOSPLINE_LEFT = 1,                                                     /* least x */
        ECHOSPLINE_RIGHT = 2,
        ECHOSPLINE_TOP = 4, /* least y: at the probe */
        ECHOSPLINE_BOTTOM = 8,
@@ -102,7 +103,7 @@ typedef struct echospline_scene_options {
   int32_t tip;
   int32_t loading;
   int32_t plane;
-  uint32_t clamped; /* bits of ECHOSPLINE_LEFT ... */
+  uint32_t clamped; /* edges that do not move: bits of ECHOSPLINE_LEFT ... */
   int32_t level;
   int32_t shape[3];             /* nodes along x, y, z, 2 or more each */
   double spacing[3];            /* mm */
@@ -114,7 +115,7 @@ typedef struct echospline_scene_options {
   double length;                /* length in the exponential of equation (15), mm */
   double drag;                  /* share of the shaft's sideways motion that contacts follow, 0 to 1 */
   double contact_spacing;       /* distance between nodes that may become contacts, mm; 0: every node */
-  double anchor_spacing;        /* greatest distance between anchors along clamped edges, mm */
+  double anchor_spacing;        /* greatest distance between anchors along held edges, mm */
   double poisson;               /* elastic kernel: Poisson's ratio */
   double radius;                /* elastic kernel: regularisation length, mm */
   const double* clamped_points; /* (clamped_point_count, dimension) mm, or NULL */
@@ -122,6 +123,9 @@ typedef struct echospline_scene_options {
   const double* stiffness; /* per mesh node, how firmly a landmark there holds its displacement; NULL: infinitely */
   int64_t stiffness_count; /* number of mesh nodes, or 0 */
   int64_t contact_room;    /* contacts for which memory is reserved; 0 chooses. More are possible and allocate once. */
+  uint32_t sliding; /* edges that move along themselves alone, without friction: bits as `clamped`. Others are free. */
+  uint32_t reserved;
+  double friction_speed; /* speed at which equation (15) says how far friction holds tissue that sticks, mm/s */
 } echospline_scene_options;
 
 typedef struct echospline_scene echospline_scene;
@@ -359,6 +363,97 @@ ECHOSPLINE_API echospline_status echospline_picture_echo(echospline_picture* pic
                                                          const double* points, int64_t point_count, double* power,
                                                          double* transmission);
 
+/* ---- Tissue under a needle's forces ------------------------------------------------------------------------------- */
+
+/* A *forced tissue* is elastic tissue in the plane under a needle that sticks, slips and cuts. The core solves the needle's forces and
+ * keeps the state; how the tissue answers forces comes from the host (finite elements, a closed form), one station of the track at a time:
+ *
+ *     while ((status = echospline_forced_advance(forced, &pose)) == ECHOSPLINE_NEEDS_STATION) {
+ *       echospline_forced_wanted(forced, &station);              where its forces act
+ *       ... columns, rows: displacement by them ...
+ *       echospline_forced_answer(forced, columns, count, rows, rows_count);
+ *     }
+ *
+ * The call is repeated with the same pose and goes on where it stopped; with another pose the unfinished step is forgotten. A
+ * station is needed about once per station_spacing of new track, and after a state of another track has been loaded. */
+
+typedef struct echospline_forced_options {
+  uint32_t struct_size;
+  int32_t level;
+  int64_t node_count;     /* of the mesh whose displacement is wanted */
+  double low[2], high[2]; /* least and greatest corner of the tissue, mm */
+  double tip;             /* cutting force, N */
+  double friction_limit;  /* per mm of shaft, N/mm */
+  double bond;            /* stiffness between shaft and tissue per mm of shaft, N/mm^2 */
+  double tip_stiffness;   /* N/mm */
+  double side_stiffness;  /* across the shaft, per mm of shaft, N/mm^2 */
+  double viscosity;       /* friction beyond its limit per mm of shaft and mm/s of slip, N s/mm^2 */
+  double station_spacing; /* mm */
+  double substep;         /* longest travel that is solved at once, mm */
+  double dead_band;       /* play in the depth to either side, mm */
+} echospline_forced_options;
+
+typedef struct echospline_station {
+  int64_t index;       /* along the track, 0 at the surface */
+  double place[2];     /* in the undeformed tissue, mm */
+  double axis[2];      /* of the needle when the tip cut there */
+  double points[8];    /* (point_count, 2) mm: where the station's force acts */
+  double weights[4];   /* share of the force at each point; they add up to 1 */
+  int32_t point_count; /* 0 to 4; 0: outside the tissue, its columns and rows are zero */
+  int32_t reserved;
+} echospline_station;
+
+typedef struct echospline_needle_load {
+  double tip;      /* of the tip along the axis, N, zero or more */
+  double friction; /* sum along the axis, N; negative on withdrawal */
+  double side;     /* sum across the axis, N; positive towards (-axis y, axis x) */
+  double torque;   /* of all forces about the entry, N mm; positive turns x towards y */
+  double cut;      /* length of track cut so far, mm */
+} echospline_needle_load;
+
+typedef struct echospline_forced echospline_forced;
+
+/* Fill options with the law's usual numbers. Node count and corners have to be set. Does nothing when options is NULL or its
+ * struct_size is not set. */
+ECHOSPLINE_API void echospline_forced_defaults(echospline_forced_options* options);
+/* A forced tissue at rest. */
+ECHOSPLINE_API echospline_status echospline_forced_create(const echospline_forced_options* options,
+                                                          echospline_forced** forced);
+ECHOSPLINE_API void echospline_forced_destroy(echospline_forced* forced);
+ECHOSPLINE_API const char* echospline_forced_message(const echospline_forced* forced);
+
+/* Back to rest: tissue that no needle has touched. Answers are kept. */
+ECHOSPLINE_API echospline_status echospline_forced_reset(echospline_forced* forced);
+/* Advance by one step: the needle has moved to pose in pose->dt seconds. The pose's speed is not read. */
+ECHOSPLINE_API echospline_status echospline_forced_advance(echospline_forced* forced, const echospline_pose* pose);
+/* The station that the last call needs. */
+ECHOSPLINE_API echospline_status echospline_forced_wanted(echospline_forced* forced, echospline_station* station);
+/* Stations that have been answered; `count` is set to their number, and no more than `room` are written. */
+ECHOSPLINE_API echospline_status echospline_forced_stations(echospline_forced* forced, echospline_station* stations,
+                                                            int64_t room, int64_t* count);
+/* Answer the wanted station. columns (2, node_count, 2): displacement of the nodes by a unit force along x, then along y, mm/N;
+ * rows (index + 1, 2, 2): [station, component, direction of the force], mean displacement over the stations before it and, last, itself.
+ * Where a station has no points columns may be NULL with count 0. Both are copied. */
+ECHOSPLINE_API echospline_status echospline_forced_answer(echospline_forced* forced, const float* columns,
+                                                          int64_t count, const double* rows, int64_t row_count);
+
+/* Forces of the present state. */
+ECHOSPLINE_API echospline_status echospline_forced_load(echospline_forced* forced, echospline_needle_load* load);
+/* Force at each of the present state's stations, (stations, 2) N; `count` is set to the stations' number, and no more than `room`
+ * forces are written. */
+ECHOSPLINE_API echospline_status echospline_forced_forces(echospline_forced* forced, double* forces, int64_t room,
+                                                          int64_t* count);
+/* Displacement of the mesh nodes, (node_count, 2) mm: columns times forces. May need stations after a state was loaded. */
+ECHOSPLINE_API echospline_status echospline_forced_displacement(echospline_forced* forced, double* displacement,
+                                                                int64_t count);
+ECHOSPLINE_API echospline_status echospline_forced_displacement_single(echospline_forced* forced, float* displacement,
+                                                                       int64_t count);
+
+/* States as bytes, as those of a tissue. They hold the track and the forces, not the answers. */
+ECHOSPLINE_API int64_t echospline_forced_state_size(const echospline_forced* forced);
+ECHOSPLINE_API echospline_status echospline_forced_state_save(echospline_forced* forced, void* bytes, int64_t size);
+ECHOSPLINE_API echospline_status echospline_forced_state_load(echospline_forced* forced, const void* bytes,
+                                                              int64_t size);
 /* ---- Space -------------------------------------------------------------------------------------------------------- */
 
 /* A volume of 8-bit voxels, x fastest, then y, then z: what a probe in space makes pictures of. */

@@ -70,6 +70,7 @@ template <int D, class Kernel, class Real>
 class FieldScene final : public SceneField<D> {
  public:
   static constexpr int c = Kernel::components;
+  static constexpr bool apart = Kernel::scalar && c > 1;
   static constexpr int64_t block = Points<D, Real>::block;
 
   const Scene<D>& scene;
@@ -77,7 +78,7 @@ class FieldScene final : public SceneField<D> {
   Points<D, Real> points;
   Array<int64_t> at;     ///< which of the points every source is
   Array<Real> mask;      ///< 1 at sources, else 0
-  Array<Real> table;     ///< in the plane: (blocks, order, c, block)
+  Array<Real> table;     ///< in the plane: (blocks, entries of `rows_of_table`, block)
   CoarseGrid<D> coarse;  ///< of a fine plane mesh
 
   explicit FieldScene(const Scene<D>& given)
@@ -110,6 +111,12 @@ class FieldScene final : public SceneField<D> {
     for (int64_t i = 0; i < K; ++i) mask[at[i]] = 1;
     return D == 3 || build_table();
   }
+  /// Numbers per point in the table: (order, c), or where the components are apart (order) of each, one after another.
+  int64_t rows_of_table() const {
+    int64_t rows = 0;
+    for (int a = 0; a < c; ++a) rows += scene.anchored.order(a);
+    return rows;
+  }
   Vec<D> contact_place(int64_t source) const override {
     Vec<D> x = scene.anchored.conditioned(scene.source[source]);
     for (int d = 0; d < D; ++d) x[d] = static_cast<Real>(x[d]);
@@ -121,15 +128,17 @@ class FieldScene final : public SceneField<D> {
   bool build_table() {
     const AnchoredKernel<D>& anchored = scene.anchored;
     Array<double> rows;
-    const int64_t m = anchored.order;
-    if (!table.reserve(points.blocks * m * c * block) || !rows.reserve(c * anchored.ld)) return false;
+    const int64_t m = rows_of_table();
+    if (!table.reserve(points.blocks * m * block) || !rows.reserve(c * anchored.ld)) return false;
     for (int64_t j = 0; j < points.room(); ++j) {
       Vec<D> p;
       for (int d = 0; d < D; ++d) p[d] = points.x[d][j];
       anchored.felt(p, rows.data());
-      Real* out = table.data() + j / block * m * c * block + j % block;
-      for (int64_t i = 0; i < m; ++i)
-        for (int a = 0; a < c; ++a, out += block) *out = static_cast<Real>(rows[a * anchored.ld + i]);
+      Real* out = table.data() + j / block * m * block + j % block;
+      for (int s = 0; s < anchored.systems; ++s)
+        for (int64_t i = 0; i < anchored.order(s); ++i)
+          for (int a = s; a < (apart ? s + 1 : c); ++a, out += block)
+            *out = static_cast<Real>(rows[a * anchored.ld + i]);
     }
     return true;
   }
@@ -139,16 +148,19 @@ template <int D, class Kernel, class Real>
 class FieldOf final : public SessionField<D> {
  public:
   static constexpr int c = Kernel::components;
+  static constexpr bool scalar = Kernel::scalar, apart = scalar && c > 1;
+  static constexpr int size = scalar ? 1 : c;  ///< of the kernel's own matrix
   static constexpr bool keeps_columns = D == 2;
   static constexpr int sides = c == 1 ? D : 1;
-  static constexpr int64_t planes_of = c == 1 ? 1 : D;  ///< planes of a column per component of its source
+  static constexpr int64_t planes_of = scalar ? 1 : D;  ///< planes of a column per component of its source
   static constexpr int64_t block = Points<D, Real>::block;
   typedef FieldScene<D, Kernel, Real> Given;
   typedef Vector<Real> V;
-  typedef std::conditional_t<D == 2 && c == 1, double, Real> Direct;  ///< in which kernels are evaluated directly
+  typedef std::conditional_t<D == 2 && scalar, double, Real> Direct;  ///< in which kernels are evaluated directly
   static constexpr int64_t direct_block = VECTORS * Lanes<Direct>::count;
 
-  explicit FieldOf(const Given& given) : given_(given), points_(given.points), anchored_(given.scene.anchored) {}
+  explicit FieldOf(const Given& given)
+      : given_(given), points_(given.points), anchored_(given.scene.anchored), table_rows_(given.rows_of_table()) {}
 
   bool build() {
     const int64_t room = points_.room();
@@ -167,7 +179,7 @@ class FieldOf final : public SessionField<D> {
     Array<double> places, landmark_weights;
     const int64_t most = anchored_.anchors + contacts + 1 + Kernel::motions;
     if (!columns.reserve(keeps_columns ? points_.blocks * (contacts + 1) * c * planes_of * block : 0) ||
-        !weights.reserve(((contacts + 1) * c + anchored_.order) * D) || !gathered.reserve(most * 2 * D) ||
+        !weights.reserve(((contacts + 1) * c + anchored_.ld) * D) || !gathered.reserve(most * 2 * D) ||
         !places.reserve(most * D) || !landmark_weights.reserve(most * D))
       return false;
     for (int64_t b = 0; keeps_columns && b < points_.blocks && kept; ++b)
@@ -178,14 +190,14 @@ class FieldOf final : public SessionField<D> {
     room_ = contacts;
     return true;
   }
-  void keep(int64_t slot, const Vec<D>& p, const Vec<D>& base, const double* held) override {
+  void keep(int64_t slot, const Vec<D>& p, const Bases<D>& base, const double* held) override {
     if constexpr (keeps_columns) keep_column(slot, p, base, held);
   }
-  void add(int64_t to, int64_t from) override {
+  void add(int64_t to, int64_t from, int component) override {
     for (int64_t b = 0; keeps_columns && b < points_.blocks; ++b) {
-      Real* child = column(b, to);
-      const Real* own = column(b, from);
-      for (int64_t i = 0; i < c * planes_of * block; i += Lanes<Real>::count)
+      Real* child = column(b, to) + component * planes_of * block;
+      const Real* own = column(b, from) + component * planes_of * block;
+      for (int64_t i = 0; i < planes_of * block; i += Lanes<Real>::count)
         store(child + i, load(child + i) + load(own + i));
     }
   }
@@ -249,15 +261,14 @@ class FieldOf final : public SessionField<D> {
   Array<Direct> gathered_;
   Array<double> places_, landmark_weights_, shares_;
   int64_t room_ = 0;
+  const int64_t table_rows_;
   struct NoFineField {};
   [[no_unique_address]] std::conditional_t<D == 2, FineField<Kernel, Real>, NoFineField> fine_;
 
   Real* column(int64_t block_index, int64_t slot) {
     return columns_.data() + (block_index * (room_ + 1) + slot) * c * planes_of * block;
   }
-  const Real* table(int64_t block_index) const {
-    return given_.table.data() + block_index * anchored_.order * c * block;
-  }
+  const Real* table(int64_t block_index) const { return given_.table.data() + block_index * table_rows_ * block; }
 
   /// Mesh displacement in planes: the field itself, or the fine one from it.
   __attribute__((noinline)) const Planes<D, Real>& mesh_planes(const LandmarkWeights<D>& landmarks) {
@@ -306,35 +317,40 @@ class FieldOf final : public SessionField<D> {
 
   // ---- The plane: kept columns --------------------------------------------------------------------------------------------------------
 
-  /// Compute a column into a slot, less that of a base. For the thin plate, whose far field is the small rest of large terms, in double: what
+  /// Compute a column into a slot, less that of its bases. For the thin plate, whose far field is the small rest of large terms, in double: what
   /// a kept column lacks stays in every field.
-  void keep_column(int64_t slot, const Vec<D>& p, const Vec<D>& base, const double* held) {
-    typedef std::conditional_t<c == 1, double, Real> Number;
+  void keep_column(int64_t slot, const Vec<D>& p, const Bases<D>& base, const double* held) {
+    typedef std::conditional_t<scalar, double, Real> Number;
     typedef Vector<Number> N;
     constexpr int lanes = Lanes<Number>::count;
     constexpr int64_t part = VECTORS * lanes;
-    const int64_t ld = anchored_.ld, m = anchored_.order;
+    const int64_t ld = anchored_.ld;
     for (int64_t first = 0; first < points_.room(); first += part) {
       const int64_t b = first / block, within = first % block;
       N a[c][planes_of][VECTORS];
       for (int v = 0; v < VECTORS; ++v) {
-        N to_p[D], to_base[D], U[c][c], other[c][c];
+        N x[D], to_p[D], to_base[D], U[size][size], other[size][size];
         for (int d = 0; d < D; ++d) {
-          const N x = load_as<Number>(points_.x[d].data() + first + v * lanes);
-          to_p[d] = x - static_cast<Number>(p[d]), to_base[d] = x - static_cast<Number>(base[d]);
+          x[d] = load_as<Number>(points_.x[d].data() + first + v * lanes);
+          to_p[d] = x[d] - static_cast<Number>(p[d]);
         }
         given_.kernel.at(to_p, U);
-        given_.kernel.at(to_base, other);
-        for (int e = 0; e < c; ++e)
-          for (int d = 0; d < planes_of; ++d) a[e][d][v] = U[d][e] - other[d][e];
+        for (int e = 0; e < c; ++e) {
+          if (e == 0 || !base.one) {
+            for (int d = 0; d < D; ++d) to_base[d] = x[d] - static_cast<Number>(base.place[e][d]);
+            given_.kernel.at(to_base, other);
+          }
+          for (int d = 0; d < planes_of; ++d) a[e][d][v] = U[d][e % size] - other[d][e % size];
+        }
       }
       const Real* t = table(b) + within;
-      for (int64_t i = 0; i < m; ++i)
-        for (int d = 0; d < planes_of; ++d, t += block)
-          for (int v = 0; v < VECTORS; ++v) {
-            const N value = load_as<Number>(t + v * lanes);
-            for (int e = 0; e < c; ++e) a[e][d][v] -= static_cast<Number>(held[e * ld + i]) * value;
-          }
+      for (int s = 0; s < (apart ? c : 1); ++s)
+        for (int64_t i = 0; i < anchored_.order(s); ++i)
+          for (int d = 0; d < planes_of; ++d, t += block)
+            for (int v = 0; v < VECTORS; ++v) {
+              const N value = load_as<Number>(t + v * lanes);
+              for (int e = s; e < (apart ? s + 1 : c); ++e) a[e][d][v] -= static_cast<Number>(held[e * ld + i]) * value;
+            }
       Real* out = column(b, slot) + within;
       for (int e = 0; e < c; ++e)
         for (int d = 0; d < planes_of; ++d)
@@ -343,7 +359,7 @@ class FieldOf final : public SessionField<D> {
   }
 
   Largest by_columns(const Weights<D>& given, Planes<D, Real>& out) {
-    const int64_t m = anchored_.order;
+    const int64_t ld = anchored_.ld;
     int64_t rows = given.count * c;
     constexpr int lanes = Lanes<Real>::count;
     Real* weight = weights_.data();
@@ -354,29 +370,36 @@ class FieldOf final : public SessionField<D> {
     Real s[D];
     for (int d = 0; d < D; ++d) s[d] = static_cast<Real>(given.s[d]);
     bool tip = given.tip;
-    if (tip && c == 1 && shares(given.held) * norm(given.s) > CAREFUL) {
+    if (tip && scalar && shares(given) > CAREFUL) {
       keep_column(given.count, given.place, given.base, given.held);
-      for (int d = 0; d < D; ++d) weight[rows * D + d] = s[d];
+      for (int d = 0; d < D; ++d) weight[rows * sides + d] = s[d];
       tip = false, rows += c;
     }
-    for (int64_t i = 0; tip && i < m; ++i) {
-      double sum = 0;
-      for (int e = 0; e < c; ++e) sum += given.held[e * anchored_.ld + i] * (c == 1 ? 1.0 : given.s[e]);
-      h[i] = static_cast<Real>(sum);
-    }
+    for (int a = 0; tip && a < (apart ? c : 1); ++a)
+      for (int64_t i = 0; i < anchored_.order(a); ++i) {
+        double sum = 0;
+        if constexpr (scalar)
+          sum = given.held[a * ld + i];
+        else
+          for (int e = 0; e < c; ++e) sum += given.held[e * ld + i] * given.s[e];
+        h[a * ld + i] = static_cast<Real>(sum);
+      }
     V change{}, reach{};
     for (int64_t b = 0; b < points_.blocks; ++b) {
       V u[D][VECTORS] = {};
       if (tip) tip_block(b, given.place, given.base, h, s, u);
       const Real* e = column(b, 0);
       const Real* f = weight;
-      for (int64_t j = 0; j < rows; ++j) {
+      for (int64_t j = 0; j < rows; j += apart ? c : 1) {
         if constexpr (c == 1) {
           for (int v = 0; v < VECTORS; ++v) {
             const V value = load(e + v * lanes);
             for (int d = 0; d < D; ++d) u[d][v] += f[d] * value;
           }
           e += block, f += D;
+        } else if constexpr (apart) {
+          for (int d = 0; d < D; ++d, e += block, ++f)
+            for (int v = 0; v < VECTORS; ++v) u[d][v] += f[0] * load(e + v * lanes);
         } else {
           for (int d = 0; d < D; ++d, e += block)
             for (int v = 0; v < VECTORS; ++v) u[d][v] += f[0] * load(e + v * lanes);
@@ -387,15 +410,19 @@ class FieldOf final : public SessionField<D> {
     }
     return {largest<Real>(change), largest<Real>(reach)};
   }
-  /// Sum of the anchors' shares in a column, regardless of sign.
-  double shares(const double* held) const {
-    double sum = 0;
-    for (int64_t i = 0; i < anchored_.anchors; ++i) sum += std::fabs(held[i]);
-    return sum;
+  /// Weight of a tip times the sum of the anchors' shares in its column, regardless of sign; the largest of the components that are apart.
+  double shares(const Weights<D>& given) const {
+    double most = 0;
+    for (int a = 0; a < (apart ? c : 1); ++a) {
+      double sum = 0;
+      for (int64_t i = 0; i < anchored_.held_by(a); ++i) sum += std::fabs(given.held[a * anchored_.ld + i]);
+      most = larger(most, sum * (apart ? std::fabs(given.s[a]) : norm(given.s)));
+    }
+    return most;
   }
 
   /// Kernel at one vector of points from a tip less from its base: U_:p - U_:q.
-  ECHOSPLINE_INLINE void kernel_difference(int64_t at, const Vec<D>& p, const Vec<D>& q, V (&U)[c][c]) const {
+  ECHOSPLINE_INLINE void kernel_difference(int64_t at, const Vec<D>& p, const Vec<D>& q, V (&U)[size][size]) const {
     V to_p[D], to_q[D];
     for (int d = 0; d < D; ++d) {
       const V x = load(points_.x[d].data() + at);
@@ -404,7 +431,7 @@ class FieldOf final : public SessionField<D> {
       to_p[d] = (x - near_p) - static_cast<Real>(p[d] - near_p),
       to_q[d] = (x - near_q) - static_cast<Real>(q[d] - near_q);
     }
-    if constexpr (D == 2 && c == 1 && sizeof(Real) == 4) {
+    if constexpr (D == 2 && scalar && sizeof(Real) == 4) {
       V r2{}, other2{}, less{};
       for (int d = 0; d < D; ++d) {
         r2 += to_p[d] * to_p[d], other2 += to_q[d] * to_q[d];
@@ -412,36 +439,46 @@ class FieldOf final : public SessionField<D> {
       }
       U[0][0] = Kernel::difference(r2, other2, less);
     } else {
-      V other[c][c];
+      V other[size][size];
       given_.kernel.at(to_p, U);
       given_.kernel.at(to_q, other);
-      for (int a = 0; a < c; ++a)
-        for (int e = 0; e < c; ++e) U[a][e] -= other[a][e];
+      for (int a = 0; a < size; ++a)
+        for (int e = 0; e < size; ++e) U[a][e] -= other[a][e];
     }
   }
-  /// The tip's part of one block, relative to a landmark: (G_:p - G_:q) s.
-  ECHOSPLINE_INLINE void tip_block(int64_t b, const Vec<D>& p, const Vec<D>& q, const Real* h, const Real (&s)[D],
+  /// The tip's part of one block, relative to landmarks: (G_:p - G_:q) s.
+  ECHOSPLINE_INLINE void tip_block(int64_t b, const Vec<D>& p, const Bases<D>& q, const Real* h, const Real (&s)[D],
                                    V (&u)[D][VECTORS]) const {
-    constexpr int lanes = Lanes<Real>::count;
-    V a[planes_of][VECTORS];
+    constexpr int lanes = Lanes<Real>::count, planes = apart ? c : planes_of;
+    V a[planes][VECTORS];
     for (int v = 0; v < VECTORS; ++v) {
-      V U[c][c];
-      kernel_difference(b * block + v * lanes, p, q, U);
-      for (int d = 0; d < planes_of; ++d) {
-        if constexpr (c == 1) {
+      V U[size][size];
+      kernel_difference(b * block + v * lanes, p, q.place[0], U);
+      for (int d = 0; d < planes; ++d) {
+        if constexpr (scalar) {
           a[d][v] = U[0][0];
         } else {
           a[d][v] = U[d][0] * s[0];
-          for (int e = 1; e < c; ++e) a[d][v] += U[d][e] * s[e];
+          for (int e = 1; q.one && e < c; ++e) a[d][v] += U[d][e] * s[e];
         }
+      }
+      for (int e = 1; !q.one && e < c; ++e) {
+        kernel_difference(b * block + v * lanes, p, q.place[e], U);
+        if constexpr (scalar)
+          a[e][v] = U[0][0];
+        else
+          for (int d = 0; d < planes; ++d) a[d][v] += U[d][e] * s[e];
       }
     }
     const Real* t = table(b);
-    for (int64_t i = 0; i < anchored_.order; ++i)
-      for (int d = 0; d < planes_of; ++d, t += block)
-        for (int v = 0; v < VECTORS; ++v) a[d][v] -= h[i] * load(t + v * lanes);
+    for (int system = 0; system < (apart ? c : 1); ++system) {
+      const Real* own = h + system * anchored_.ld;
+      for (int64_t i = 0; i < anchored_.order(system); ++i)
+        for (int d = system; d < (apart ? system + 1 : planes); ++d, t += block)
+          for (int v = 0; v < VECTORS; ++v) a[d][v] -= own[i] * load(t + v * lanes);
+    }
     for (int d = 0; d < D; ++d)
-      for (int v = 0; v < VECTORS; ++v) u[d][v] = c == 1 ? s[d] * a[0][v] : a[c == 1 ? 0 : d][v];
+      for (int v = 0; v < VECTORS; ++v) u[d][v] = scalar ? s[d] * a[apart ? d : 0][v] : a[scalar ? 0 : d][v];
   }
 
   // ---- Anywhere: kernels evaluated where the field is wanted ------------------------------------------------------------------------------
@@ -497,7 +534,7 @@ class FieldOf final : public SessionField<D> {
     const Direct* a = gathered_.data() + count * 2 * D;
     for (int d = 0; d < D; ++d)
       for (int v = 0; v < VECTORS; ++v) {
-        if constexpr (c == 1) {
+        if constexpr (scalar) {
           u[d][v] = all<Direct>(a[d]);
           for (int e = 0; e < D; ++e) u[d][v] += a[(e + 1) * D + d] * x[e][v];
         } else if constexpr (D == 2) {

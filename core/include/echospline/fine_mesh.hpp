@@ -35,7 +35,7 @@ struct Planes;
 template <class Kernel, class Real>
 class FineField {
  public:
-  static constexpr int D = 2, c = Kernel::components, planes = c == 1 ? 1 : D;
+  static constexpr int D = 2, planes = Kernel::scalar ? 1 : D;
   static constexpr int SIDE = 2 * REACH + 4;  // coarse points along a side of the region around a landmark
 
   Planes<D, Real> field;  ///< (ny, nx) per component, mm
@@ -108,8 +108,8 @@ class FineField {
       }
       for (int d = 0; d < D; ++d) {
         Real* out = field.u[d].data() + y * nx + x0;
-        const Real* rest = sum + (c == 1 ? 0 : d) * wide_;
-        const Real factor = c == 1 ? weight[d] : Real(1);
+        const Real* rest = sum + (Kernel::scalar ? 0 : d) * wide_;
+        const Real factor = Kernel::scalar ? weight[d] : Real(1);
         for (int64_t x = begin[0] - x0; x < count; ++x) out[x] += factor * rest[x];
       }
     }
@@ -168,10 +168,10 @@ class FineField {
   template <class Number>
   ECHOSPLINE_INLINE static void response(const Kernel& kernel, const Number (&offset)[D], const Real* weight,
                                          Number (&f)[planes]) {
-    Number U[c][c];
+    Number U[planes][planes];
     kernel.at(offset, U);
     for (int d = 0; d < planes; ++d) {
-      if constexpr (c == 1)
+      if constexpr (Kernel::scalar)
         f[d] = U[0][0];
       else
         f[d] = U[d][0] * weight[0] + U[d][1] * weight[1];

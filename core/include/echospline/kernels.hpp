@@ -19,6 +19,7 @@ ECHOSPLINE_INLINE double inverse_root(double x) { return 1 / std::sqrt(x); }
 template <int D>
 struct ThinPlate {
   static constexpr int components = 1;
+  static constexpr bool scalar = true;                 ///< one number at an offset serves all components
   static constexpr int motions = D + 1;                ///< polynomials
   static constexpr int length_power = D == 2 ? 2 : 1;  ///< of the kernel's values
   static constexpr double per_spring = D == 2 ? 16 * PI : 8 * PI;
@@ -58,12 +59,21 @@ struct ThinPlate {
   }
 };
 
+/// A thin plate per component of the displacement, each with anchors of its own: for scenes with sliding edges.
+template <int D>
+struct PlatesApart : ThinPlate<D> {
+  static constexpr int components = D;
+
+  static PlatesApart from(double, double) { return {}; }
+};
+
 /// Regularised fundamental solution of elasticity (Kelvin): a matrix couples the components, with the rigid motions. In the plane
 /// -(lap(phi) I - c grad grad(phi)) with phi = s ln s, s = r^2 + radius^2, c = 1 / (2 (1 - nu)) and nu / (1 + nu) for nu in plane stress
 /// (Davis et al. 1997); in space the regularised Kelvinlet (de Goes and James 2017).
 template <int D>
 struct Elastic {
   static constexpr int components = D;
+  static constexpr bool scalar = false;
   static constexpr int motions = D == 2 ? 3 : 6;
   static constexpr int length_power = D == 2 ? 0 : -1;
   static constexpr double per_spring = 16 * PI;
@@ -109,7 +119,7 @@ struct Elastic {
   /// What stands before the unit matrix and before x x' in U at an offset x.
   template <class Number>
   ECHOSPLINE_INLINE void parts(const Number (&offset)[D], Number& own, Number& both) const {
-    typedef std::remove_cvref_t<decltype(scalar(offset[0]))> Real;
+    typedef std::remove_cvref_t<decltype(entry(offset[0]))> Real;
     const Real c = static_cast<Real>(coupling), e2 = static_cast<Real>(radius2);
     Number r2 = offset[0] * offset[0];
     for (int d = 1; d < D; ++d) r2 += offset[d] * offset[d];
@@ -122,52 +132,56 @@ struct Elastic {
       own = p3 * ((Real(4) - c) * s + Real(2) * e2), both = c * p3;
     }
   }
-  static float scalar(Floats);
-  static double scalar(Doubles);
-  static double scalar(double);
+  static float entry(Floats);
+  static double entry(Doubles);
+  static double entry(double);
 };
 
 /// A kernel as the algebra of landmarks sees it, which is the same for all: numbers and functions in double precision.
 template <int D>
 struct KernelOf {
   int components;            ///< c
-  int motions;               ///< polynomials
+  bool apart;                ///< components do not act on one another: each has a system of its own
+  bool affine;               ///< every affine motion is free of energy; otherwise the rigid ones
+  int motions;               ///< polynomials, of each system
   int length_power;          ///< of the kernel's values
   double per_spring;         ///< what a spring of stiffness k adds, times k
   double coupling, radius2;  ///< as `from` takes them
   void (*at)(const KernelOf& own, const Vec<D>& offset, double (&U)[D][D]);
-  /// At the offsets from `count` places to x: (c, c) rows of `count` numbers, `stride` from a component of x to the next.
-  void (*along)(const KernelOf& own, const Vec<D>& x, const double* const (&place)[D], int64_t count, double* out,
-                int64_t stride);
-  void (*motion)(const Vec<D>& x, double* out, int64_t stride);  ///< (c, motions)
+  /// Field at x of component e at `count` places: a row of `count` numbers per component of the field, `stride` from one to the next.
+  /// Where components are apart, row e alone is written.
+  void (*along)(const KernelOf& own, int e, const Vec<D>& x, const double* const (&place)[D], int64_t count,
+                double* out, int64_t stride);
+  void (*motion)(const Vec<D>& x, double* out, int64_t stride);  ///< (c, motions); one row where components are apart
 };
 
 template <int D, class Kernel>
 struct KernelFunctions {
-  static constexpr int c = Kernel::components;
+  static constexpr int c = Kernel::components, rows = Kernel::scalar ? 1 : c;  ///< rows of the kernel's own matrix
   static void at(const KernelOf<D>& own, const Vec<D>& offset, double (&U)[D][D]) {
-    double small[c][c];
+    double small[rows][rows];
     Kernel::from(own.coupling, own.radius2).at(offset.v, small);
     for (int a = 0; a < c; ++a)
-      for (int e = 0; e < c; ++e) U[a][e] = small[a][e];
+      for (int e = 0; e < c; ++e) U[a][e] = !Kernel::scalar ? small[a % rows][e % rows] : a == e ? small[0][0] : 0;
   }
-  static void along(const KernelOf<D>& own, const Vec<D>& x, const double* const (&place)[D], int64_t count,
+  static void along(const KernelOf<D>& own, int e, const Vec<D>& x, const double* const (&place)[D], int64_t count,
                     double* out, int64_t stride) {
     const Kernel kernel = Kernel::from(own.coupling, own.radius2);
     for (int64_t i = 0; i < count; i += DOUBLE_LANES) {
-      Doubles offset[D], U[c][c];
+      Doubles offset[D], U[rows][rows];
       for (int d = 0; d < D; ++d) offset[d] = x[d] - load(place[d] + i);
       kernel.at(offset, U);
-      for (int a = 0; a < c; ++a)
-        for (int e = 0; e < c; ++e)
-          for (int64_t l = 0; l < smaller<int64_t>(DOUBLE_LANES, count - i); ++l)
-            out[a * stride + e * count + i + l] = U[a][e][l];
+      for (int a = 0; a < rows; ++a) {
+        double* row = out + (Kernel::scalar ? e : a) * stride;
+        for (int64_t l = 0; l < smaller<int64_t>(DOUBLE_LANES, count - i); ++l)
+          row[i + l] = U[a][Kernel::scalar ? 0 : e][l];
+      }
     }
   }
   static void motion(const Vec<D>& x, double* out, int64_t stride) {
-    double R[c][Kernel::motions];
+    double R[rows][Kernel::motions];
     Kernel::motion(x, R);
-    for (int a = 0; a < c; ++a)
+    for (int a = 0; a < rows; ++a)
       for (int j = 0; j < Kernel::motions; ++j) out[a * stride + j] = R[a][j];
   }
 };
@@ -176,8 +190,17 @@ struct KernelFunctions {
 template <int D, class Kernel>
 KernelOf<D> kernel_of(double coupling, double radius2) {
   typedef KernelFunctions<D, Kernel> Functions;
-  return {Kernel::components, Kernel::motions,  Kernel::length_power, Kernel::per_spring, coupling, radius2,
-          Functions::at,      Functions::along, Functions::motion};
+  return {Kernel::components,
+          Kernel::scalar && Kernel::components > 1,
+          Kernel::scalar,
+          Kernel::motions,
+          Kernel::length_power,
+          Kernel::per_spring,
+          coupling,
+          radius2,
+          Functions::at,
+          Functions::along,
+          Functions::motion};
 }
 
 }  // namespace echospline::ECHOSPLINE_CORE

@@ -13,9 +13,12 @@ namespace echospline::ECHOSPLINE_CORE {
 constexpr double ZERO_LENGTH =
     1e-9;  // mm; a needle shorter than this has no direction, touches nothing and pushes nothing
 constexpr double LET_GO =
-    1e-4;  // mm; a landmark that has left the needle is dropped once this close to the field without it
+    2e-5;  // mm; a landmark that has left the needle is dropped once this close to the field without it
 constexpr double CALM =
     2.5;  // no node moves further in a step than this times the needle's travel and the relaxation due
+constexpr double SUBSTEP =
+    0.25;  // mm of travel after which a step looks again at who touches the needle: longer ones would depend on the time step
+constexpr int MOST_SUBSTEPS = 100;  // in one step; a needle that moves further at once has been put elsewhere, not moved
 constexpr double ARRIVED = 1e-4;  // mm; a needle this near to where it is commanded is put exactly there
 
 /// Parameters of the interaction, in the paper's names.
@@ -26,33 +29,51 @@ struct Interaction {
   double alpha3;          ///< relaxation, (16), 1/s
   double length;          ///< in the exponential of (15), mm
   double drag;            ///< share of sideways motion that contacts follow
+  double friction_speed;  ///< at which (15) says how far friction holds tissue that sticks, mm/s
   bool immediate;         ///< friction is there at once, as printed
+  bool sticks;            ///< tissue sticks to the shaft and slips; otherwise it follows friction and relaxes
   bool on_node;           ///< the tip's landmark is the nearest mesh node, as printed
-};
-
-/// A pose and how the needle came there.
-template <int D>
-struct Needle {
-  Vec<D> entry, tip, axis;
-  double depth, speed;
-  double travel;  ///< longest way that a point of the shaft has moved, mm; infinite with immediate loading
-  double dt;
 };
 
 template <int D>
 struct Pose {
   Vec<D> entry, tip;
 };
+template <int D>
+inline Pose<D> between(const Pose<D>& a, const Pose<D>& b, double share) {
+  return {a.entry + share * (b.entry - a.entry), a.tip + share * (b.tip - a.tip)};
+}
+/// Longest way that a point of the shaft has moved between two poses, mm: a straight needle, at one of its ends.
+template <int D>
+inline double travel_of(const Pose<D>& a, const Pose<D>& b) {
+  return larger(norm(b.entry - a.entry), norm(b.tip - a.tip));
+}
+/// Unit vector from entry to tip; zero for a needle of zero length.
+template <int D>
+inline Vec<D> axis_of(const Pose<D>& pose) {
+  const double depth = norm(pose.tip - pose.entry);
+  return (depth >= ZERO_LENGTH ? 1 / depth : 0.0) * (pose.tip - pose.entry);
+}
+
+/// A pose and how the needle came there.
+template <int D>
+struct Needle {
+  Vec<D> entry, tip, axis;
+  Vec<D> tip_before, axis_before;
+  double depth, speed;
+  double moved;   ///< way of the shaft along its axis, mm; negative on withdrawal
+  double travel;  ///< longest way that a point of the shaft has moved, mm; infinite with immediate loading
+  double dt;
+};
 
 template <int D>
-inline Needle<D> needle_at(const echospline_pose& pose, const Pose<D>* before, bool immediate) {
+inline Needle<D> needle_at(const Pose<D>& before, const Pose<D>& now, double speed, double dt, bool immediate) {
   Needle<D> n;
-  n.entry = point_of<D>(pose.entry), n.tip = point_of<D>(pose.tip);
-  n.depth = norm(n.tip - n.entry);
-  n.axis = (n.depth >= ZERO_LENGTH ? 1 / n.depth : 0.0) * (n.tip - n.entry);
-  n.travel = before ? larger(norm(n.entry - before->entry), norm(n.tip - before->tip)) : n.depth;
-  if (immediate) n.travel = INFINITY;
-  n.speed = pose.speed, n.dt = pose.dt;
+  n.entry = now.entry, n.tip = now.tip, n.axis = axis_of(now), n.depth = norm(now.tip - now.entry);
+  n.tip_before = before.tip, n.axis_before = axis_of(before);
+  n.moved = dot(n.tip - before.tip, n.axis);
+  n.travel = immediate ? INFINITY : travel_of(before, now);
+  n.speed = speed, n.dt = dt;
   return n;
 }
 
@@ -73,6 +94,18 @@ inline Distance<D> distance(const Needle<D>& n, const Vec<D>& p, const Vec<D>& u
 /// Displacement along the axis of tissue at distance d from the shaft, equations (14) and (15), mm.
 inline double friction(const Interaction& p, double d, double speed) {
   return (p.alpha1 + p.alpha2 / (1 + std::exp(smaller(d / p.length, 700.0)))) * speed;
+}
+/// What friction asks for beside what is clamped, which cannot follow: it fades over five times itself, mm. A landmark there that did follow
+/// would give the spline a slope at the clamp, which a thin plate carries far away.
+inline double yielding(double f, double clearance) {
+  const double reach = 5 * std::fabs(f);
+  if (!(clearance < reach)) return f;
+  const double near = clearance / reach, step = near * near * (3 - 2 * near);
+  return f * step * step;
+}
+/// How far the tip pushes, mm, where friction is not at once: beside what is clamped it fades as friction does.
+inline double tip_push_yielding(const Interaction& p, double depth, double clearance) {
+  return yielding(smaller(p.sigma, depth), clearance);
 }
 /// Share of a displacement that is left after dt, equation (16).
 inline double kept(const Interaction& p, double dt) { return std::exp(-p.alpha3 * dt); }

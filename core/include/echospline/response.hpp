@@ -103,7 +103,7 @@ class Response {
   Array<double> across[D];   ///< the same, a row per coordinate
   Array<double> felt, held;  ///< of the contacts, (room c, ld)
   Array<double> gram, P;     ///< (room c, ldk)
-  Array<int32_t> parent;     ///< slot whose column a contact's is relative to; negative: an anchor's; (room)
+  Array<int32_t> parent;     ///< slots whose columns a contact's is relative to; negative: an anchor's; (room, c)
   Array<int32_t> by_age;     ///< slots, the oldest first: parents stand before their children
   double residual = 0;
   int64_t rebuilt = 0;
@@ -122,12 +122,12 @@ class Response {
     Array<int32_t> new_source, new_parent, new_by_age;
     Array<Vec<D>> new_place;
     Array<double> new_felt, new_held, new_gram, new_P;
-    if (!new_source.reserve(contacts) || !new_parent.reserve(contacts) || !new_by_age.reserve(contacts) ||
+    if (!new_source.reserve(contacts) || !new_parent.reserve(contacts * c) || !new_by_age.reserve(contacts) ||
         !new_place.reserve(contacts) || !new_felt.reserve(contacts * c * ld) || !new_held.reserve(contacts * c * ld) ||
         !new_gram.reserve(contacts * c * wide) || !new_P.reserve(contacts * c * wide) ||
         !border_.reserve(c, ld, wide) || !carried_.reserve(c, wide) || !field_->reserve(contacts, count))
       return false;
-    copy_rows(new_source, source_of, count, 1, 1, 1), copy_rows(new_parent, parent, count, 1, 1, 1);
+    copy_rows(new_source, source_of, count, 1, 1, 1), copy_rows(new_parent, parent, count, c, c, c);
     copy_rows(new_by_age, by_age, count, 1, 1, 1), copy_rows(new_place, place, count, 1, 1, 1);
     copy_rows(new_felt, felt, count * c, ld, ld, ld), copy_rows(new_held, held, count * c, ld, ld, ld);
     copy_rows(new_gram, gram, count * c, wide, ldk, count * c), copy_rows(new_P, P, count * c, wide, ldk, count * c);
@@ -150,12 +150,14 @@ class Response {
     const double* places[D];
     for (int d = 0; d < D; ++d) places[d] = across[d].data();
     double* U = tip.Pg.data();  // until P g is known
-    anchored_->kernel.along(anchored_->kernel, p, places, count, U, ldk);
+    for (int e = 0; e < c; ++e) anchored_->kernel.along(anchored_->kernel, e, p, places, count, U + e * count, ldk);
     for (int a = 0; a < c; ++a)
       for (int64_t j = 0; j < count; ++j)
         for (int e = 0; e < c; ++e)
           tip.g[a * ldk + j * c + e] =
-              U[a * ldk + e * count + j] - dot(felt.data() + (j * c + e) * ld, tip.held.data() + a * ld, ld);
+              anchored_->acts(e, a)
+                  ? U[a * ldk + e * count + j] - dot(felt.data() + (j * c + e) * ld, tip.held.data() + a * ld, ld)
+                  : 0.0;
     for (int a = 0; a < c; ++a) {
       for (int64_t i = count * c; i < n; ++i) tip.g[a * ldk + i] = tip.Pg[a * ldk + i] = 0;
       for (int64_t i = 0; i < count * c; ++i) tip.Pg[a * ldk + i] = dot(P.data() + i * ldk, tip.g.data() + a * ldk, n);
@@ -237,11 +239,13 @@ class Response {
     }
     for (int a = 0; a < c; ++a)
       for (int e = 0; e < c; ++e) P[(kc + a) * ldk + kc + e] = V[a][e], gram[(kc + a) * ldk + kc + e] = S[a][e];
-    const Base base = nearest(p);
-    parent[k] = static_cast<int32_t>(base.slot), by_age[k] = static_cast<int32_t>(k);
+    Base base[D];
+    const Bases<D> bases = nearest(p, base);
+    for (int e = 0; e < c; ++e) parent[k * c + e] = static_cast<int32_t>(base[e].slot);
+    by_age[k] = static_cast<int32_t>(k);
     count = k + 1;
     subtract_held(base, border_.held.data());
-    field_->keep(k, p, base.place, border_.held.data());
+    field_->keep(k, p, bases, border_.held.data());
     return true;
   }
 
@@ -291,13 +295,13 @@ class Response {
     Weights<D> given;
     given.count = count, given.at_rest = at_rest;
     given.carried = &carried_.values[0], given.ld = carried_.ld;
-    const Base base = tip ? nearest(tip->place) : Base{{}, -1, -1};
-    carry(w, base.slot, s);
+    Base base[D];
+    if (tip) given.base = nearest(tip->place, base);
+    carry(w, base, s);
     if (tip) {
       std::memcpy(border_.held.data(), tip->held.data(), static_cast<size_t>(c * anchored_->ld) * sizeof(double));
       subtract_held(base, border_.held.data());
-      given.tip = true, given.place = tip->place, given.base = base.place, given.s = s,
-      given.held = border_.held.data();
+      given.tip = true, given.place = tip->place, given.s = s, given.held = border_.held.data();
     }
     if (field_->needs_landmarks()) gather(w, tip, s, given.landmarks);
     return field_->compute(given);
@@ -305,33 +309,41 @@ class Response {
 
   /// All landmarks as kernels at their places with their weights: anchors, contacts, tip; then the motions' coefficients.
   void gather(const Sides<D>& w, const Column<D>* tip, const Vec<D>& s, LandmarkWeights<D>& out) {
-    const int64_t b = anchored_->anchors, m = anchored_->order, total = b + count + (tip ? 1 : 0);
+    const int64_t b = anchored_->anchors, total = b + count + (tip ? 1 : 0), ld = anchored_->ld;
     field_->reserve_landmarks(out);
     out.count = total;
     for (int64_t i = 0; i < b; ++i)
-      for (int d = 0; d < D; ++d) out.place[i * D + d] = anchored_->place[d][i];
+      for (int d = 0; d < D; ++d) out.place[i * D + d] = anchored_->place[d][i], out.weight[i * D + d] = 0;
     for (int64_t j = 0; j < count; ++j)
       for (int d = 0; d < D; ++d) out.place[(b + j) * D + d] = place[j][d], out.weight[(b + j) * D + d] = w.at(j, d);
     if (tip)
       for (int d = 0; d < D; ++d)
         out.place[(b + count) * D + d] = tip->place[d], out.weight[(b + count) * D + d] = s[d];
-    // anchors and motions: -(held w + held_tip s)
-    for (int r = 0; r < w.count; ++r)
-      for (int64_t i = 0; i < m; ++i) {
+    // anchors and motions: -(held w + held_tip s), for each system and each right-hand side of it
+    const bool apart = anchored_->systems > 1;
+    for (int r = 0; r < (apart ? c : w.count); ++r) {
+      const int first = apart ? r : 0, step = apart ? c : 1;  // of the rows of `held` that the system has
+      const double* side = w.side(apart ? 0 : r);
+      const auto weight = [&](int64_t i) {
         double sum = 0;
-        for (int64_t j = 0; j < count * c; ++j) sum -= held[j * anchored_->ld + i] * w.side(r)[j];
+        for (int64_t j = first; j < count * c; j += step) sum -= held[j * ld + i] * side[j];
         if (tip)
-          for (int a = 0; a < c; ++a) sum -= tip->held[a * anchored_->ld + i] * s[c == 1 ? r : a];
-        if (i >= b * c) {
-          out.weight[(total + i - b * c) * D + r] = sum;
-          continue;
-        }
+          for (int a = first; a < (apart ? r + 1 : c); ++a) sum -= tip->held[a * ld + i] * s[c == 1 ? r : a];
+        return sum;
+      };
+      for (int e = first; e < (apart ? r + 1 : c); ++e) {
         // the weight of a difference is that of the anchor, and less that of its parent, which stands before it
-        const int d = c == 1 ? r : static_cast<int>(i / b);
-        const int64_t anchor = i % b, from = anchored_->parent[anchor];
-        out.weight[anchor * D + d] = sum;
-        if (from >= 0) out.weight[from * D + d] -= sum;
+        const AnchorRow<D>& own = anchored_->row[e];
+        const int d = c == 1 ? r : e;
+        for (int64_t i = 0; i < own.count; ++i) {
+          const double sum = weight(own.first + i);
+          out.weight[own.anchor[i] * D + d] = sum;
+          if (own.parent[i] >= 0) out.weight[own.anchor[own.parent[i]] * D + d] -= sum;
+        }
       }
+      const int64_t n = anchored_->held_by(r);
+      for (int64_t j = 0; j < anchored_->kernel.motions; ++j) out.weight[(total + j) * D + r] = weight(n + j);
+    }
   }
 
  private:
@@ -355,55 +367,67 @@ class Response {
 
   /// Landmark that another's column is relative to.
   struct Base {
-    Vec<D> place;    ///< conditioned
-    int64_t slot;    ///< of a contact, or negative
-    int64_t anchor;  ///< or negative
+    Vec<D> place;         ///< conditioned
+    int64_t slot = -1;    ///< of a contact, or negative
+    int64_t anchor = -1;  ///< in the row of the component, or negative
   };
-  /// Landmark nearest to a conditioned point.
-  Base nearest(const Vec<D>& p) const {
-    Base base{{}, -1, -1};
+  /// Landmarks nearest to a conditioned point, one for each component.
+  Bases<D> nearest(const Vec<D>& p, Base (&base)[D]) const {
+    Bases<D> bases;
+    Base contact{{}, -1, -1};
     double least = INFINITY;
     for (int64_t j = 0; j < count; ++j) {
       const Vec<D> gap = place[j] - p;
-      if (dot(gap, gap) < least) least = dot(gap, gap), base = {place[j], j, -1};
+      if (dot(gap, gap) < least) least = dot(gap, gap), contact = {place[j], j, -1};
     }
-    for (int64_t i = 0; i < anchored_->anchors; ++i) {
-      const Vec<D> gap = anchored_->anchor(i) - p;
-      if (dot(gap, gap) < least) least = dot(gap, gap), base = {anchored_->anchor(i), -1, i};
+    for (int e = 0; e < c; ++e) {
+      const AnchorRow<D>& row = anchored_->row[e];
+      base[e] = e && anchored_->alike ? base[0] : contact;
+      double nearest = least;
+      for (int64_t i = 0; i < (e && anchored_->alike ? 0 : row.count); ++i) {
+        const Vec<D> gap = row.at(i) - p;
+        if (dot(gap, gap) < nearest) nearest = dot(gap, gap), base[e] = {row.at(i), -1, i};
+      }
+      bases.place[e] = base[e].place;
+      for (int d = 0; d < D; ++d) bases.one = bases.one && base[e].place[d] == base[0].place[d];
     }
-    return base;
+    return bases;
   }
-  /// L_B^-1 [U P]' of a point less that of a base, (c, ld). That of an anchor is 1 for itself and all its ancestors, for their kernels are
+  /// L_B^-1 [U P]' of a point less that of its bases, (c, ld). That of an anchor is 1 for itself and all its ancestors, for their kernels are
   /// differences.
-  void subtract_held(const Base& base, double* rows) const {
+  void subtract_held(const Base (&base)[D], double* rows) const {
     const int64_t ld = anchored_->ld;
     for (int e = 0; e < c; ++e) {
-      if (base.slot >= 0)
-        add(rows + e * ld, -1, held.data() + (base.slot * c + e) * ld, ld);
+      const AnchorRow<D>& row = anchored_->row[e];
+      if (base[e].slot >= 0)
+        add(rows + e * ld, -1, held.data() + (base[e].slot * c + e) * ld, ld);
       else
-        for (int64_t i = base.anchor; i >= 0; i = anchored_->parent[i]) rows[e * ld + e * anchored_->anchors + i] -= 1;
+        for (int64_t i = base[e].anchor; i >= 0; i = row.parent[i]) rows[e * ld + row.first + i] -= 1;
     }
   }
-  /// Give a contact's children to its parent before the contact goes and the last slot is renamed.
+  /// Give a contact's children to its parents before the contact goes and the last slot is renamed.
   void leave_family(int64_t slot, int64_t last) {
     const int32_t gone = static_cast<int32_t>(slot);
     for (int64_t j = 0; j < count; ++j)
-      if (parent[j] == gone) parent[j] = parent[slot], field_->add(j, slot);
+      for (int e = 0; e < c; ++e)
+        if (parent[j * c + e] == gone) parent[j * c + e] = parent[slot * c + e], field_->add(j, slot, e);
     int64_t at = 0;
     for (int64_t i = 0; i < count; ++i)
       if (by_age[i] != gone) by_age[at++] = by_age[i] == static_cast<int32_t>(last) ? gone : by_age[i];
-    for (int64_t j = 0; j < count; ++j)
+    for (int64_t j = 0; j < count * c; ++j)
       if (parent[j] == static_cast<int32_t>(last)) parent[j] = gone;
-    parent[slot] = parent[last];
+    for (int e = 0; e < c; ++e) parent[slot * c + e] = parent[last * c + e];
   }
   /// Weights of the kept columns: those of contacts, with what each carries for its descendants and for a tip that is relative to it.
-  void carry(const Sides<D>& w, int64_t base, const Vec<D>& s) {
+  void carry(const Sides<D>& w, const Base (&base)[D], const Vec<D>& s) {
     for (int r = 0; r < w.count; ++r)
       std::memcpy(carried_.side(r), w.side(r), static_cast<size_t>(count * c) * sizeof(double));
-    for (int d = 0; base >= 0 && d < D; ++d) carried_.at(base, d) += s[d];
+    for (int d = 0; d < D; ++d)
+      if (base[d % c].slot >= 0) carried_.at(base[d % c].slot, d) += s[d];
     for (int64_t i = count; i-- > 0;) {
-      const int64_t child = by_age[i], to = parent[child];
-      for (int d = 0; to >= 0 && d < D; ++d) carried_.at(to, d) += carried_.at(child, d);
+      const int64_t child = by_age[i];
+      for (int d = 0; d < D; ++d)
+        if (const int64_t to = parent[child * c + d % c]; to >= 0) carried_.at(to, d) += carried_.at(child, d);
     }
   }
 

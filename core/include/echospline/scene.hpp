@@ -1,4 +1,4 @@
-// A scene: mesh, clamped edges, parameters, and what can be computed of them once. Never changes after `build`; threads share it.
+// A scene: mesh, what is held, parameters, and what can be computed of them once. Never changes after `build`; threads share it.
 #pragma once
 #include "anchored_kernel.hpp"
 #include "grid.hpp"
@@ -35,6 +35,7 @@ struct Scene {
   AnchoredKernel<D> anchored;
   Array<double> stiffness;  ///< per node; empty: infinite
   Array<Vec<D>> source;     ///< rest position of every source, mm
+  Array<double> clearance;  ///< distance of every source to what is clamped, mm; beside a sliding edge tissue can follow
   SceneField<D>* field = nullptr;
   int64_t contact_room = 0;
   uint64_t fingerprint = 0;  ///< of everything that a state depends on
@@ -52,16 +53,20 @@ struct Scene {
   /// Compute what grid, clamps, interaction and stiffness imply.
   template <class KernelFor>
   Outcome build(double contact_spacing, double anchor_spacing, KernelFor kernel_for, FieldFor field_for) {
-    Array<Vec<D>> anchors;
-    if (!anchors.reserve(clamps.anchors(grid, anchor_spacing, nullptr))) return no_memory;
-    const int64_t count = clamps.anchors(grid, anchor_spacing, anchors.data());
+    Array<Anchor<D>> anchors;
+    const bool affine = kernel_for(1.0).affine;
+    if (!anchors.reserve(clamps.anchors(grid, anchor_spacing, affine, nullptr))) return no_memory;
+    const int64_t count = clamps.anchors(grid, anchor_spacing, affine, anchors.data());
     switch (anchored.build(anchors.data(), count, kernel_for)) {
       case AnchoredKernel<D>::no_memory: return no_memory;
       case AnchoredKernel<D>::not_held: return not_held;
       case AnchoredKernel<D>::ready: break;
     }
-    if (!lattice.build(grid, clamps, contact_spacing) || !source.reserve(lattice.node.size())) return no_memory;
-    for (int64_t i = 0; i < sources(); ++i) source[i] = grid.place(lattice.node[i]);
+    if (!lattice.build(grid, clamps, contact_spacing) || !source.reserve(lattice.node.size()) ||
+        !clearance.reserve(lattice.node.size()))
+      return no_memory;
+    for (int64_t i = 0; i < sources(); ++i)
+      source[i] = grid.place(lattice.node[i]), clearance[i] = clamps.clearance(grid, source[i], Vec<D>{});
     field = field_for(*this);
     return field ? ready : no_memory;
   }

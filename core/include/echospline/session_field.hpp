@@ -20,6 +20,14 @@ struct LandmarkWeights {
       nullptr;  ///< (count, D), then (motions, D) of the affine motions or (motions) rows of which the first number counts
 };
 
+/// Landmarks that the column of another is relative to, one for each component of its weight: a landmark near a sliding edge has an anchor
+/// near it for one component alone.
+template <int D>
+struct Bases {
+  Vec<D> place[D] = {};  ///< conditioned
+  bool one = true;       ///< all are the same
+};
+
 /// What a field is computed from.
 template <int D>
 struct Weights {
@@ -27,10 +35,11 @@ struct Weights {
   const double* carried = nullptr;  ///< weights of their kept columns, as `Sides`
   int64_t ld = 0;                   ///< of `carried`
   bool tip = false;                 ///< whether there is a tip with a column of its own
-  Vec<D> place{}, base{}, s{};  ///< of the tip and the landmark that its column is relative to, conditioned; its weight
-  const double* held = nullptr;  ///< L_B^-1 [U P]' of the tip less that of its base
-  bool at_rest = false;          ///< into the field at rest instead of the next one
-  LandmarkWeights<D> landmarks;  ///< where the field needs them
+  Vec<D> place{}, s{};              ///< of the tip, conditioned; its weight
+  Bases<D> base;                    ///< that its column is relative to
+  const double* held = nullptr;     ///< L_B^-1 [U P]' of the tip less that of its bases
+  bool at_rest = false;             ///< into the field at rest instead of the next one
+  LandmarkWeights<D> landmarks;     ///< where the field needs them
 };
 
 /// The field of one session. Functions that a class behind this one does not replace are never called.
@@ -40,10 +49,10 @@ class SessionField {
   virtual void destroy() { __builtin_trap(); }
   /// Room for columns of contacts; `kept` of them stay.
   virtual bool reserve(int64_t, int64_t) { __builtin_trap(); }
-  /// Compute and keep the column of a landmark at p, less that of its base; `held` is L_B^-1 [U P]' of it less that of its base.
-  virtual void keep(int64_t, const Vec<D>&, const Vec<D>&, const double*) { __builtin_trap(); }
-  /// Add a column to another; move one to another slot.
-  virtual void add(int64_t, int64_t) { __builtin_trap(); }
+  /// Compute and keep the column of a landmark at p, less that of its bases; `held` is L_B^-1 [U P]' of it less that of its bases.
+  virtual void keep(int64_t, const Vec<D>&, const Bases<D>&, const double*) { __builtin_trap(); }
+  /// Add one component of a column to another; move one to another slot.
+  virtual void add(int64_t, int64_t, int) { __builtin_trap(); }
   virtual void move(int64_t, int64_t) { __builtin_trap(); }
 
   virtual bool needs_landmarks() const { __builtin_trap(); }

@@ -5,7 +5,8 @@
 
 namespace echospline::ECHOSPLINE_CORE {
 
-constexpr double SAME_PLACE = 1e-6;  // mm; a tip closer than this to a contact replaces it as landmark
+constexpr double SAME_PLACE =
+    1e-6;  // mm; a tip closer than this to a contact replaces it as landmark, and to what is clamped pushes nothing
 constexpr double PARALLEL = 1e-12;   // sine of the angle below which a shaft runs along a line of nodes
 
 /// A node that is a landmark: it touches the needle, or has left it and relaxes.
@@ -68,38 +69,27 @@ class Tissue {
     field_->clear();
   }
 
-  /// State after the needle has moved to a pose. On failure the state has not changed.
-  Outcome advance(const echospline_pose& pose) {
-    const Interaction& p = scene.interaction;
-    const Needle<D> n = needle_at<D>(pose, state.posed ? &state.before : nullptr, p.immediate);
-    Outcome outcome = touch(n);
-    if (outcome == done) outcome = set_contacts(next_, next_count_);
-    if (outcome != done) return outcome;
-
-    Step step;
-    const Sides<D>& given = move(n, step);
-    const Largest most = spread(given, step, false);
-    double reach2 = most.reach2;
-    int64_t held_back = state.held_back;
-    const double limit = allowed(n);
-    if (most.change2 > limit * limit) {
-      hold_back(step, limit);
-      reach2 = reach2_of_next();
-      ++held_back;
+  /// State after the needle has moved to a pose. On failure the state has not changed. A needle that moves far does so in substeps, so that
+  /// what it touches and leaves does not depend on the time step.
+  Outcome advance(const echospline_pose& given) {
+    const bool immediate = scene.interaction.immediate;
+    const Pose<D> now{point_of<D>(given.entry), point_of<D>(given.tip)};
+    const Pose<D> before = state.posed ? state.before : Pose<D>{now.entry, now.entry};
+    const double pieces = std::ceil(travel_of(before, now) / SUBSTEP - 1e-9);
+    const int parts = immediate ? 1 : static_cast<int>(smaller(larger(pieces, 1.0), 1.0 * MOST_SUBSTEPS));
+    const int64_t held_back = state.held_back;
+    if (parts > 1) keep_state();
+    Pose<D> from = before;
+    for (int part = 1; part <= parts; ++part) {
+      const Pose<D> to = part == parts ? now : between(before, now, static_cast<double>(part) / parts);
+      const Outcome outcome = substep(needle_at(from, to, given.speed, given.dt / parts, immediate));
+      if (outcome != done) {
+        if (part > 1) go_back();
+        return outcome;
+      }
+      from = to;
     }
-    for (int64_t j = 0; j < next_count_; ++j) next_[j].q = new_q_[j];
-    const int64_t kept_count = release();
-    if (kept_count < next_count_) {
-      next_count_ = kept_count;
-      outcome = set_contacts(next_, next_count_);
-      if (outcome != done) return outcome;
-      reach2 = solve_and_spread(next_, next_count_, step.tip).reach2;
-    }
-    // nothing can fail from here on
-    state.contacts.swap(next_);
-    state.count = next_count_, state.tip = step.tip, state.posed = true, state.before = {n.entry, n.tip};
-    state.reach = std::sqrt(reach2), state.held_back = held_back;
-    field_->commit();
+    state.held_back = held_back + (state.held_back > held_back);
     ++steps;
     return done;
   }
@@ -160,6 +150,54 @@ class Tissue {
   Array<int64_t> leaving_;
   Array<double> small_, small_sides_;
 
+  Array<Contact<D>> kept_;  ///< contacts of the state before a step, in which more than one substep may fail
+  State<D> kept_state_;     ///< the rest of it
+  Array<double> while_touched_, since_left_;  ///< of the contacts of `next_`: way of the needle, mm
+
+  void keep_state() {
+    for (int64_t j = 0; j < state.count; ++j) kept_[j] = state.contacts[j];
+    kept_state_.count = state.count, kept_state_.tip = state.tip, kept_state_.posed = state.posed;
+    kept_state_.before = state.before, kept_state_.held_back = state.held_back;
+  }
+  /// Back to the state that was kept: its contacts have been solved before.
+  void go_back() {
+    restore(kept_state_.count, [&](Array<Contact<D>>& contacts, State<D>& fresh) {
+      for (int64_t j = 0; j < kept_state_.count; ++j) contacts[j] = kept_[j];
+      fresh.tip = kept_state_.tip, fresh.posed = kept_state_.posed, fresh.before = kept_state_.before;
+      fresh.held_back = kept_state_.held_back;
+    });
+  }
+
+  /// State after the needle has moved by a short way. On failure the state has not changed.
+  Outcome substep(const Needle<D>& n) {
+    Outcome outcome = touch(n);
+    if (outcome == done) outcome = set_contacts(next_, next_count_);
+    if (outcome != done) return outcome;
+
+    Step step;
+    const Sides<D>& given = move(n, step);
+    const Largest most = spread(given, step, false);
+    double reach2 = most.reach2;
+    int64_t held_back = state.held_back;
+    const double limit = allowed(n);
+    if (most.change2 > limit * limit) {
+      hold_back(n, step, limit);
+      reach2 = reach2_of_next();
+      ++held_back;
+    }
+    for (int64_t j = 0; j < next_count_; ++j) next_[j].q = new_q_[j];
+    if (release(step)) {
+      if (!response_.check(q_, w_)) return not_solved;
+      reach2 = solve_and_spread(next_, next_count_, step.tip).reach2;
+    }
+    // nothing can fail from here on
+    state.contacts.swap(next_);
+    state.count = next_count_, state.tip = step.tip, state.posed = true, state.before = {n.entry, n.tip};
+    state.reach = std::sqrt(reach2), state.held_back = held_back;
+    field_->commit();
+    return done;
+  }
+
   /// What one step decides.
   struct Step {
     TipLandmark<D> tip;
@@ -183,16 +221,17 @@ class Tissue {
 
   bool reserve(int64_t contacts) {
     const int64_t wide = rounded_up(contacts * c, ROW), ld = scene.anchored.ld;
-    Array<Contact<D>> kept, kept_next;
-    if (!kept.reserve(contacts) || !kept_next.reserve(contacts)) return false;
+    Array<Contact<D>> kept, kept_next, kept_before;
+    if (!kept.reserve(contacts) || !kept_next.reserve(contacts) || !kept_before.reserve(contacts)) return false;
+    for (int64_t i = 0; i < kept_state_.count; ++i) kept_before[i] = kept_[i];
     for (int64_t i = 0; i < state.count; ++i) kept[i] = state.contacts[i];
     for (int64_t i = 0; i < next_count_; ++i) kept_next[i] = next_[i];
     if (!new_q_.reserve(contacts) || !free_.reserve(contacts) || !tip_column_.reserve(c, ld, wide) ||
         !other_column_.reserve(c, ld, wide) || !q_.reserve(c, wide) || !w_.reserve(c, wide) ||
         !leaving_.reserve(contacts) || !small_.reserve(contacts * c * wide) || !small_sides_.reserve(D * wide) ||
-        !response_.reserve(contacts))
+        !while_touched_.reserve(contacts) || !since_left_.reserve(contacts) || !response_.reserve(contacts))
       return false;
-    state.contacts.swap(kept), next_.swap(kept_next);
+    state.contacts.swap(kept), next_.swap(kept_next), kept_.swap(kept_before);
     return true;
   }
   bool grow(int64_t contacts) {
@@ -241,8 +280,9 @@ class Tissue {
       } else if (n.depth >= ZERO_LENGTH) {
         along = distance(n, scene.source[source], field_->now(source), p.drag).along;
       }
-      Contact<D>& row = next_[rows++];
       const bool held = old && old->touching;
+      ways(n, scene.source[source], touching, held, while_touched_[rows], since_left_[rows]);
+      Contact<D>& row = next_[rows++];
       row.source = static_cast<int32_t>(source), row.touching = touching;
       row.q = old ? old->q : field_->now(source);
       row.along = held ? old->along : smaller(larger(along, 0.0), n.depth);
@@ -251,6 +291,21 @@ class Tissue {
     }
     next_count_ = rows;
     return done;
+  }
+
+  /// How far the needle moved while it touched a contact, and since it left it, mm. The tip has passed a contact that joins, and drawn back
+  /// from one that leaves, somewhere within the step.
+  void ways(const Needle<D>& n, const Vec<D>& p, bool touching, bool held, double& touched, double& left) const {
+    touched = touching ? n.travel : 0.0, left = touching ? 0.0 : n.travel;
+    if (touching == held || scene.interaction.immediate) return;
+    const bool out = n.depth < ZERO_LENGTH;
+    const double passed = n.depth - scene.lattice.gap - dot(p - n.entry, out ? n.axis_before : n.axis);
+    if (touching) {
+      touched = smaller(larger(passed, 0.0), n.travel);
+    } else {
+      if (passed < 0 || out) left = smaller(larger(-passed, 0.0), n.travel);
+      touched = n.travel - left;
+    }
   }
 
   /// Number of sources that are touched, are contacts already, or both.
@@ -325,18 +380,27 @@ class Tissue {
 
   // ---- How the landmarks move ---------------------------------------------------------------------------------------------------------
 
-  /// New displacement of a contact that touches the needle, equations (14) to (16): loaded while friction asks for more than it has, by at
-  /// most the needle's travel; otherwise it relaxes. Across the axis it follows the shaft.
-  Vec<D> loaded(const Contact<D>& contact, const Needle<D>& n, double left_over) const {
+  /// New displacement of a contact that touches the needle, or touched it in this step; equations (14) to (16). Across the axis it follows
+  /// the shaft. Along it, tissue that sticks moves with the shaft within what friction holds, the stop operator of Coulomb friction; otherwise
+  /// it is loaded while friction asks for more than it has, by at most the needle's way, or relaxes.
+  Vec<D> loaded(const Contact<D>& contact, const Needle<D>& n, double way, double left_over) const {
     const Interaction& p = scene.interaction;
     const double d = std::sqrt(distance(n, scene.source[contact.source], contact.q, p.drag).d2);
-    const double f = friction(p, d, n.speed), along = dot(contact.q, n.axis);
+    const double along = dot(contact.q, n.axis);
+    double f = friction(p, d, p.sticks ? p.friction_speed : n.speed);
+    if (!p.immediate) f = yielding(f, scene.clearance[contact.source]);
+    // a shaft that hardly is in the tissue drags it no further than its own depth
+    const double most = p.immediate ? INFINITY : n.depth;
+    const Vec<D> side = across(contact.grip + p.drag * (n.entry + contact.along * n.axis), n.axis);
+    if (p.sticks) {
+      const double held = smaller(std::fabs(f), most), moved = smaller(larger(n.moved, -way), way);
+      return towards(contact.q, smaller(larger(along + moved, -held), held) * n.axis + side, way);
+    }
     const double sign = f > 0 ? 1.0 : f < 0 ? -1.0 : 0.0;
     const bool loading = sign * (f - along) > 0 || (p.immediate && f != 0);
     const double relaxed = loading ? along : f + (along - f) * left_over;
-    const Vec<D> side = across(contact.grip + p.drag * (n.entry + contact.along * n.axis), n.axis);
-    const Vec<D> rested = contact.q + (relaxed - along) * n.axis;
-    return towards(rested, (loading ? f : relaxed) * n.axis + side, n.travel);
+    const double wanted = smaller(larger(loading ? f : relaxed, -most), most);
+    return towards(contact.q + (relaxed - along) * n.axis, wanted * n.axis + side, way);
   }
 
   enum TipKind { none, given, follows, leaves };
@@ -344,15 +408,18 @@ class Tissue {
     const Interaction& p = scene.interaction;
     const TipLandmark<D>& before = state.tip;
     const bool advancing = n.speed >= 0 && n.depth >= ZERO_LENGTH;
-    if (clearance <= 0 || p.sigma <= 0) return none;
-    if (p.on_node || p.immediate) return advancing && can_move ? given : none;
-    // a tip that pushes into tissue where nodes still relax waits until they are gone: two landmarks in one place would tear the field
-    double free = INFINITY;
-    for (int64_t j = 0; j < next_count_; ++j)
-      if (!next_[j].touching) free = smaller(free, norm(scene.source[next_[j].source] - n.tip));
+    if (p.sigma <= 0) return none;
+    if (p.on_node || p.immediate) return clearance > 0 && advancing && can_move ? given : none;
     const bool back = !before.present || before.pushed || norm(n.tip - before.place) <= larger(n.travel, LET_GO);
-    if (!(advancing && free > scene.lattice.gap && back)) return before.present ? leaves : none;
+    if (!(advancing && clearance > SAME_PLACE && clear_of_leaving(n.tip) && back)) return before.present ? leaves : none;
     return before.present || n.speed > 0 ? follows : none;
+  }
+  /// A tip that begins to push into tissue where nodes still relax waits until they are gone: two landmarks in one place would tear the field.
+  bool clear_of_leaving(const Vec<D>& p) const {
+    double nearest = INFINITY;
+    for (int64_t j = 0; j < next_count_; ++j)
+      if (!next_[j].touching) nearest = smaller(nearest, norm(scene.source[next_[j].source] - p));
+    return nearest > scene.lattice.gap;
   }
 
   /// Right-hand sides `q_` for the contacts of `next_`; the tip's displacement for one that it replaces.
@@ -374,8 +441,14 @@ class Tissue {
     const Interaction& p = scene.interaction;
     const int64_t k = next_count_;
     const double left_over = kept(p, n.dt);
-    for (int64_t j = 0; j < k; ++j) new_q_[j] = next_[j].touching ? loaded(next_[j], n, left_over) : next_[j].q;
-    move_tip(n, left_over, step);
+    for (int64_t j = 0; j < k; ++j) {
+      const bool handled = next_[j].touching || while_touched_[j] > 0;  // one that has just left was dragged until then
+      new_q_[j] = handled ? loaded(next_[j], n, while_touched_[j], left_over) : next_[j].q;
+    }
+    if (p.sticks && !p.on_node)
+      move_sticking_tip(n, left_over, step);
+    else
+      move_tip(n, left_over, step);
     step.on_tip = contact_at(next_, k, step.tip);
     int64_t leaving = 0;
     for (int64_t j = 0; j < k; ++j)
@@ -383,7 +456,11 @@ class Tissue {
     if (leaving) find_free(leaving, step);
     if (step.on_tip >= 0) free_[step.on_tip] = step.tip.q;
     for (int64_t j = 0; j < k; ++j)
-      if (!next_[j].touching) new_q_[j] = towards(free_[j] + left_over * (next_[j].q - free_[j]), free_[j], n.travel);
+      if (!next_[j].touching) {
+        const bool whole = !(n.travel > 0 && n.travel < INFINITY) || since_left_[j] == n.travel;
+        const double left = whole ? left_over : kept(p, n.dt * (since_left_[j] / n.travel));
+        new_q_[j] = towards(free_[j] + left * (new_q_[j] - free_[j]), free_[j], since_left_[j]);
+      }
     fill(k, step, [&](int64_t j) { return new_q_[j]; });
     return q_;
   }
@@ -392,7 +469,7 @@ class Tissue {
   void move_tip(const Needle<D>& n, double left_over, Step& step) {
     const Interaction& p = scene.interaction;
     const TipLandmark<D>& before = state.tip;
-    const double clearance = scene.clamps.clearance(scene.grid, n.tip);
+    const double clearance = scene.clamps.clearance(scene.grid, n.tip, n.axis);
     Vec<D> place = n.tip;
     bool can_move = true;
     if (p.on_node) {
@@ -401,8 +478,8 @@ class Tissue {
     }
     const TipKind kind = tip_kind(n, clearance, can_move);
     if (kind == none) return;
-    const double push = tip_push(p, n.depth, clearance);
-    if (kind == leaves) place = before.place;
+    const double push = p.immediate ? tip_push(p, n.depth, clearance) : tip_push_yielding(p, n.depth, clearance);
+    if (kind == leaves) return leave_tip(left_over, n.travel, true, step);
     step.softness = scene.softness_near(place);
     response_.meet(scene.anchored.conditioned(place), tip_column_);
     TipLandmark<D>& tip = step.tip;
@@ -420,18 +497,63 @@ class Tissue {
     }
     fill(next_count_, step, [&](int64_t j) { return new_q_[j]; });
     const Vec<D> free = response_.at(tip_column_, q_);
-    if (kind == follows) {
-      double ahead = push;
-      if (n.speed <= 0) {  // (17): at rest the whole field relaxes, the tip's push with the contacts
-        was = was - dot(was, n.axis) * (1 - left_over) * n.axis;
-        ahead = smaller(dot(was, n.axis), push);
-      }
-      tip.present = tip.pushed = true;
-      tip.q = towards(was, ahead * n.axis + across(free, n.axis), n.travel);
-    } else if (norm(before.q - free) > LET_GO) {
-      tip.present = true, tip.pushed = false;
-      tip.q = towards(free + left_over * (before.q - free), free, n.travel);
+    double ahead = push;
+    if (n.speed <= 0) {  // (17): at rest the whole field relaxes, the tip's push with the contacts
+      was = was - dot(was, n.axis) * (1 - left_over) * n.axis;
+      ahead = smaller(dot(was, n.axis), push);
     }
+    tip.present = tip.pushed = true;
+    tip.q = towards(was, ahead * n.axis + across(free, n.axis), n.travel);
+  }
+
+  /// The tip's landmark where it pushes and never pulls: a stop with one side, whatever the speed. It moves on with a tip that advances, pushed
+  /// ahead by up to sigma. A tip that draws back lets the tissue there come back by as much, until the landmark does nothing and is gone; one
+  /// that returns before that takes it up.
+  void move_sticking_tip(const Needle<D>& n, double left_over, Step& step) {
+    const Interaction& p = scene.interaction;
+    const TipLandmark<D>& before = state.tip;
+    if (!(p.sigma > 0)) return;
+    double lead = 0;
+    bool leaving = n.depth < ZERO_LENGTH;
+    if (before.present && before.pushed)
+      lead = larger(0.0, dot(before.place - n.tip_before, n.axis_before) - n.moved);
+    else if (before.present)
+      leaving = leaving || n.moved <= 0 || norm(n.tip - before.place) > larger(n.travel, LET_GO);
+    const Vec<D> place = n.tip + lead * n.axis;
+    const double clearance = scene.clamps.clearance(scene.grid, place, n.axis);
+    if (leaving || clearance <= SAME_PLACE) {
+      if (before.present) leave_tip(left_over, n.travel, true, step);
+      return;
+    }
+    if (!before.present && (n.moved <= 0 || !clear_of_leaving(place))) return;
+    step.softness = scene.softness_near(place);
+    response_.meet(scene.anchored.conditioned(place), tip_column_);
+    Vec<D> was = before.q;  // or the displacement that the tissue had there before the step
+    if (!before.present) {
+      fill(next_count_, step, [&](int64_t j) { return next_[j].q; });
+      was = response_.at(tip_column_, q_);
+    }
+    fill(next_count_, step, [&](int64_t j) { return new_q_[j]; });
+    const Vec<D> free = response_.at(tip_column_, q_);
+    const double push = tip_push_yielding(p, n.depth, clearance);
+    const double ahead = larger(smaller(dot(was, n.axis) + n.moved, push), dot(free, n.axis));
+    const Vec<D> pushed = towards(was, ahead * n.axis + across(free, n.axis), n.travel);
+    if (n.moved <= 0 && norm(pushed - free) <= LET_GO) return;
+    step.tip.present = step.tip.pushed = true, step.tip.place = place, step.tip.q = pushed;
+  }
+
+  /// Let the landmark that the tip has left relax to the field without it, then go where `drop` says so.
+  void leave_tip(double left_over, double travel, bool drop, Step& step) {
+    const TipLandmark<D>& before = state.tip;
+    step.tip = {}, step.on_tip = -1;
+    step.softness = scene.softness_near(before.place);
+    response_.meet(scene.anchored.conditioned(before.place), tip_column_);
+    fill(next_count_, step, [&](int64_t j) { return new_q_[j]; });
+    const Vec<D> free = response_.at(tip_column_, q_);
+    step.tip.place = before.place;
+    if (drop && norm(before.q - free) <= LET_GO) return;
+    step.tip.present = true, step.tip.pushed = false;
+    step.tip.q = towards(free + left_over * (before.q - free), free, travel);
   }
 
   /// Field at the contacts that have left, if they were no landmarks. With F those, and P' the inverse for contacts and tip, it is
@@ -539,17 +661,38 @@ class Tissue {
 
   /// Move the landmarks only so far that no node moves beyond the limit. A few landmarks close together can swing the field far from them
   /// much further than they move themselves. Landmarks that stay at the displacement which the field already has change nothing, and the field
-  /// is linear in their displacements, so the largest share that keeps the limit is found at once.
-  void hold_back(Step& step, double limit) {
+  /// is linear in their displacements, so the largest share that keeps the limit is found at once. Only a tip that moves on takes a landmark
+  /// away where it was; where that alone is too much, it leaves its landmark there.
+  void hold_back(const Needle<D>& n, Step& step, double limit) {
     Step stay = step;
     if (step.tip.present) stay.tip.q = value_before(step.tip.place);
-    fill(next_count_, stay, [&](int64_t j) { return next_[j].q; });
-    if (step.has_column()) response_.meet(scene.anchored.conditioned(step.tip.place), tip_column_);
-    spread(q_, stay, true);
+    spread_at_rest(stay);
+    if (state.tip.present && change2_at_rest() > limit * limit) {
+      leave_tip(kept(scene.interaction, n.dt), limit / CALM, false, step);
+      step.on_tip = contact_at(next_, next_count_, step.tip);
+      fill(next_count_, step, [&](int64_t j) { return new_q_[j]; });
+      spread(q_, step, false);
+      stay = step, stay.tip.q = state.tip.q;
+      spread_at_rest(stay);
+    }
     const double share = largest_share(limit);
     for (int64_t j = 0; j < next_count_; ++j) new_q_[j] = next_[j].q + share * (new_q_[j] - next_[j].q);
     step.tip.q = stay.tip.q + share * (step.tip.q - stay.tip.q);
     field_->blend(share);
+  }
+  /// Field of landmarks that stay where the field has them.
+  void spread_at_rest(Step& stay) {
+    fill(next_count_, stay, [&](int64_t j) { return next_[j].q; });
+    if (stay.has_column()) response_.meet(scene.anchored.conditioned(stay.tip.place), tip_column_);
+    spread(q_, stay, true);
+  }
+  double change2_at_rest() const {
+    double change2 = 0;
+    for (int64_t i = 0; i < scene.sources(); ++i) {
+      const Vec<D> change = field_->rest(i) - field_->now(i);
+      change2 = larger(change2, dot(change, change));
+    }
+    return change2;
   }
   /// Largest t in [0, 1] with |rest + t (next - rest) - field| <= limit at every source; 0 where even `rest` is beyond.
   double largest_share(double limit) const {
@@ -578,12 +721,67 @@ class Tissue {
     return u + response_.times(G, s);
   }
 
-  /// Keep the contacts that touch the needle or are not yet at rest in the field without them; how many.
-  int64_t release() {
-    int64_t kept_count = 0;
-    for (int64_t j = 0; j < next_count_; ++j)
-      if (next_[j].touching || norm(next_[j].q - free_[j]) > LET_GO) next_[kept_count++] = next_[j];
-    return kept_count;
+  /// Drop contacts that the needle has left and that no longer matter; whether there were any. One that has come to where it goes may still
+  /// hold back others that have not; so each is judged by the field without it alone, and all that go in one step change the field by no
+  /// more than one may.
+  bool release(const Step& given) {
+    Step step = given;
+    double changed = 0;
+    bool weighed = false, any = false;
+    for (int64_t j = 0; j < next_count_;) {
+      if (next_[j].touching || norm(next_[j].q - free_[j]) > LET_GO) {
+        ++j;
+        continue;
+      }
+      if (!weighed) weigh(step);
+      weighed = true;
+      const double change = j == step.on_tip ? norm(next_[j].q - step.tip.q) : misfit_without(j, step);
+      if (!(changed + change <= LET_GO)) {
+        ++j;
+        continue;
+      }
+      changed += change, any = true, weighed = false;
+      response_.leave(response_.slot_of[next_[j].source]), ++left;
+      --next_count_;
+      for (int64_t i = j; i < next_count_; ++i) next_[i] = next_[i + 1], free_[i] = free_[i + 1];
+      step.on_tip = contact_at(next_, next_count_, step.tip);
+    }
+    return any;
+  }
+  /// Weights (`w_`) of the contacts as they are, and of the step's tip.
+  void weigh(Step& step) {
+    fill(next_count_, step, [&](int64_t j) { return next_[j].q; });
+    const Column<D>* column = step.has_column() ? &tip_column_ : nullptr;
+    if (column) {
+      response_.meet(scene.anchored.conditioned(step.tip.place), tip_column_);
+      step.softness = scene.softness_near(step.tip.place);
+      step.s = response_.tip_weight(tip_column_, q_, step.tip.q, step.softness);
+    }
+    response_.weights(q_, column, step.s, w_);
+  }
+  /// Distance of a contact's displacement from the field that there is without it, mm: its weight over its diagonal of the inverse.
+  double misfit_without(int64_t j, const Step& step) const {
+    const int64_t slot = response_.slot_of[next_[j].source], ldk = response_.ldk;
+    const Column<D>& column = tip_column_;
+    double own[D][D], S[D][D] = {}, inverse[D][D] = {};
+    if (step.has_column()) {
+      response_.add_softness(column.own, step.softness, S);
+      invert_small<D>(c, S, inverse);
+    }
+    for (int a = 0; a < c; ++a)
+      for (int e = 0; e < c; ++e) {
+        const int64_t x = slot * c + a, y = slot * c + e;
+        own[a][e] = response_.P[x * ldk + y];
+        for (int f = 0; step.has_column() && f < c; ++f)
+          for (int g = 0; g < c; ++g) own[a][e] += column.Pg[f * ldk + x] * inverse[f][g] * column.Pg[g * ldk + y];
+      }
+    Vec<D> misfit;
+    for (int d = 0; d < D; ++d) misfit[d] = w_.at(slot, d);
+    if (c == 1)
+      for (int d = 0; d < D; ++d) misfit[d] /= own[0][0];
+    else
+      solve_small<D>(D, own, misfit.v);
+    return norm(misfit);
   }
 };
 

@@ -33,6 +33,7 @@ class Status(IntEnum):
     NOT_SOLVED = 6
     WRONG_STATE = 7
     FAILED_HANDLE = 8
+    NEEDS_STATION = 9
 
 
 class Level(IntEnum):
@@ -72,6 +73,7 @@ class Loading(IntEnum):
 
     FOLLOW = 0
     IMMEDIATE = 1
+    STICK = 2
 
 
 class Plane(IntEnum):
@@ -181,6 +183,9 @@ class SceneOptions(ctypes.Structure):
         ("stiffness", c_void_p),
         ("stiffness_count", c_int64),
         ("contact_room", c_int64),
+        ("sliding", c_uint32),
+        ("reserved", c_uint32),
+        ("friction_speed", c_double),
     ]
 
 
@@ -299,6 +304,53 @@ class PictureReport(ctypes.Structure):
     ]
 
 
+class ForcedOptions(ctypes.Structure):
+    """echospline_forced_options."""
+
+    _fields_ = [
+        ("struct_size", c_uint32),
+        ("level", c_int32),
+        ("node_count", c_int64),
+        ("low", c_double * 2),
+        ("high", c_double * 2),
+        ("tip", c_double),
+        ("friction_limit", c_double),
+        ("bond", c_double),
+        ("tip_stiffness", c_double),
+        ("side_stiffness", c_double),
+        ("viscosity", c_double),
+        ("station_spacing", c_double),
+        ("substep", c_double),
+        ("dead_band", c_double),
+    ]
+
+
+class Station(ctypes.Structure):
+    """echospline_station."""
+
+    _fields_ = [
+        ("index", c_int64),
+        ("place", c_double * 2),
+        ("axis", c_double * 2),
+        ("points", c_double * 8),
+        ("weights", c_double * 4),
+        ("point_count", c_int32),
+        ("reserved", c_int32),
+    ]
+
+
+class NeedleLoad(ctypes.Structure):
+    """echospline_needle_load."""
+
+    _fields_ = [
+        ("tip", c_double),
+        ("friction", c_double),
+        ("side", c_double),
+        ("torque", c_double),
+        ("cut", c_double),
+    ]
+
+
 class VolumeOptions(ctypes.Structure):
     """echospline_volume_options."""
 
@@ -395,6 +447,22 @@ FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {  # name: result, arguments; hand
     "echospline_picture_inverse": (c_int32, [c_void_p, c_void_p, c_void_p, c_int64]),
     "echospline_picture_check": (c_int32, [c_void_p, POINTER(PictureReport)]),
     "echospline_picture_echo": (c_int32, [c_void_p, POINTER(Needle), c_void_p, c_int64, c_void_p, c_void_p]),
+    "echospline_forced_defaults": (None, [POINTER(ForcedOptions)]),
+    "echospline_forced_create": (c_int32, [POINTER(ForcedOptions), POINTER(c_void_p)]),
+    "echospline_forced_destroy": (None, [c_void_p]),
+    "echospline_forced_message": (c_char_p, [c_void_p]),
+    "echospline_forced_reset": (c_int32, [c_void_p]),
+    "echospline_forced_advance": (c_int32, [c_void_p, POINTER(Pose)]),
+    "echospline_forced_wanted": (c_int32, [c_void_p, POINTER(Station)]),
+    "echospline_forced_stations": (c_int32, [c_void_p, c_void_p, c_int64, POINTER(c_int64)]),
+    "echospline_forced_answer": (c_int32, [c_void_p, c_void_p, c_int64, c_void_p, c_int64]),
+    "echospline_forced_load": (c_int32, [c_void_p, POINTER(NeedleLoad)]),
+    "echospline_forced_forces": (c_int32, [c_void_p, c_void_p, c_int64, POINTER(c_int64)]),
+    "echospline_forced_displacement": (c_int32, [c_void_p, c_void_p, c_int64]),
+    "echospline_forced_displacement_single": (c_int32, [c_void_p, c_void_p, c_int64]),
+    "echospline_forced_state_size": (c_int64, [c_void_p]),
+    "echospline_forced_state_save": (c_int32, [c_void_p, c_void_p, c_int64]),
+    "echospline_forced_state_load": (c_int32, [c_void_p, c_void_p, c_int64]),
     "echospline_volume_create": (c_int32, [POINTER(VolumeOptions), c_void_p, POINTER(c_void_p)]),
     "echospline_volume_destroy": (None, [c_void_p]),
     "echospline_volume_message": (c_char_p, [c_void_p]),
@@ -412,6 +480,11 @@ SHORT = (  # calls of a microsecond: to release the interpreter lock and fetch i
     "echospline_tissue_statistics",
     "echospline_displacement",
     "echospline_follow",
+    "echospline_forced_wanted",
+    "echospline_forced_load",
+    "echospline_forced_forces",
+    "echospline_forced_state_size",
+    "echospline_forced_state_save",
 )
 
 

@@ -9,7 +9,7 @@ export const VERSION = "0.1.0";
 
 export const Status = Object.freeze({
   OK: 0, NULL_POINTER: 1, WRONG_SIZE: 2, WRONG_VALUE: 3, OUT_OF_MEMORY: 4, NOT_HELD: 5, NOT_SOLVED: 6, WRONG_STATE: 7,
-  FAILED_HANDLE: 8,
+  FAILED_HANDLE: 8, NEEDS_STATION: 9,
 });
 export const Level = Object.freeze({
   LEVEL_BEST: 0, LEVEL_BASELINE: 1, LEVEL_AVX2: 2, LEVEL_AVX512: 3, LEVEL_NEON: 4, LEVEL_SIMD128: 5,
@@ -17,7 +17,7 @@ export const Level = Object.freeze({
 export const Kernel = Object.freeze({ THIN_PLATE: 0, ELASTIC: 1 });
 export const Precision = Object.freeze({ SINGLE: 0, DOUBLE: 1 });
 export const Tip = Object.freeze({ TIP_POINT: 0, TIP_NODE: 1 });
-export const Loading = Object.freeze({ FOLLOW: 0, IMMEDIATE: 1 });
+export const Loading = Object.freeze({ FOLLOW: 0, IMMEDIATE: 1, STICK: 2 });
 export const Plane = Object.freeze({ PLANE_STRESS: 0, PLANE_STRAIN: 1 });
 export const Edge = Object.freeze({ LEFT: 1, RIGHT: 2, TOP: 4, BOTTOM: 8, FRONT: 16, BACK: 32 });
 export const PixelType = Object.freeze({ UINT8: 0, UINT16: 1, INT16: 2, FLOAT32: 3 });
@@ -39,7 +39,7 @@ export const LandmarkKind = Object.freeze({ CONTACT: 0, LEAVING: 1, TIP: 2, TIP_
  *   clamped?: number, level?: number, shape?: Numbers, spacing?: Numbers, origin?: Numbers, sigma?: number,
  *   delta?: number, alpha1?: number, alpha2?: number, alpha3?: number, length?: number, drag?: number,
  *   contact_spacing?: number, anchor_spacing?: number, poisson?: number, radius?: number, clamped_points?: Numbers,
- *   stiffness?: Numbers, contact_room?: number
+ *   stiffness?: Numbers, contact_room?: number, sliding?: number, friction_speed?: number
  * }} SceneOptions
  */
 /**
@@ -71,6 +71,26 @@ export const LandmarkKind = Object.freeze({ CONTACT: 0, LEAVING: 1, TIP: 2, TIP_
  * }} Statistics
  */
 
+/**
+ * Options of a forced tissue, named as in echospline_forced_options; what is not given keeps the core's default.
+ * @typedef {{
+ *   level?: number, node_count: number, low: Numbers, high: Numbers, tip?: number, friction_limit?: number, bond?: number,
+ *   tip_stiffness?: number, side_stiffness?: number, viscosity?: number, station_spacing?: number, substep?: number,
+ *   dead_band?: number
+ * }} ForcedOptions
+ */
+/**
+ * @typedef {{
+ *   index: number, place: number[], axis: number[], points: number[], weights: number[], point_count: number
+ * }} Station
+ */
+/** @typedef {{ tip: number, friction: number, side: number, torque: number, cut: number }} NeedleLoad */
+/**
+ * How tissue answers a station: displacement of the nodes by a unit force along x, then along y, (2, nodes, 2) mm/N, and mean
+ * displacement over the stations so far, (index + 1, 2, 2) mm/N. `stations` are those before it.
+ * @typedef {(wanted: Station, stations: Station[]) => { columns: Float32Array, rows: Numbers }} Answer
+ */
+
 const BYTES = { i32: 4, u32: 4, i64: 8, f64: 8, pointer: 4 };
 
 /**
@@ -100,6 +120,7 @@ export const LAYOUTS = Object.freeze({
     ["alpha2", "f64"], ["alpha3", "f64"], ["length", "f64"], ["drag", "f64"], ["contact_spacing", "f64"],
     ["anchor_spacing", "f64"], ["poisson", "f64"], ["radius", "f64"], ["clamped_points", "pointer"],
     ["clamped_point_count", "i64"], ["stiffness", "pointer"], ["stiffness_count", "i64"], ["contact_room", "i64"],
+    ["sliding", "u32"], ["reserved", "u32"], ["friction_speed", "f64"],
   ]),
   echospline_pose: layout([["entry", "f64", 3], ["tip", "f64", 3], ["speed", "f64"], ["dt", "f64"]]),
   echospline_command: layout([["entry", "f64", 3], ["tip", "f64", 3], ["lag", "f64"], ["fastest", "f64"]]),
@@ -129,6 +150,16 @@ export const LAYOUTS = Object.freeze({
     ["struct_size", "u32"], ["method", "i32"], ["residual", "f64"], ["difference", "f64"], ["exact_share", "f64"],
     ["folded_cells", "i64"], ["smallest_jacobian", "f64"], ["place", "f64", 2],
   ]),
+  echospline_forced_options: layout([
+    ["struct_size", "u32"], ["level", "i32"], ["node_count", "i64"], ["low", "f64", 2], ["high", "f64", 2],
+    ["tip", "f64"], ["friction_limit", "f64"], ["bond", "f64"], ["tip_stiffness", "f64"], ["side_stiffness", "f64"],
+    ["viscosity", "f64"], ["station_spacing", "f64"], ["substep", "f64"], ["dead_band", "f64"],
+  ]),
+  echospline_station: layout([
+    ["index", "i64"], ["place", "f64", 2], ["axis", "f64", 2], ["points", "f64", 8], ["weights", "f64", 4],
+    ["point_count", "i32"], ["reserved", "i32"],
+  ]),
+  echospline_needle_load: layout([["tip", "f64"], ["friction", "f64"], ["side", "f64"], ["torque", "f64"], ["cut", "f64"]]),
 });
 
 /** A call of the core that did not succeed; `status` is one of Status. */
@@ -183,6 +214,14 @@ export class Core {
   /** Make a picture of undeformed tissue. @param {PictureOptions} options @param {Pixels} pixels @returns {Picture} */
   picture(options, pixels) {
     return new Picture(this, options, pixels);
+  }
+
+  /**
+   * Tissue at rest under a needle that sticks, slips and cuts.
+   * @param {ForcedOptions} options @param {Answer} answer @returns {Forced}
+   */
+  forced(options, answer) {
+    return new Forced(this, options, answer);
   }
 
   /**
@@ -344,6 +383,165 @@ export class Scene {
   destroy() {
     this.core.functions.echospline_scene_destroy(this.handle);
     this.handle = 0;
+  }
+}
+
+/** Tissue in the plane under a needle that sticks, slips and cuts; how it answers forces comes from outside. */
+export class Forced {
+  /** @param {Core} core @param {ForcedOptions} options @param {Answer} answer */
+  constructor(core, options, answer) {
+    this.core = core;
+    this.answer = answer;
+    this.numbers = 2 * options.node_count;
+    const shape = LAYOUTS.echospline_forced_options;
+    const at = core.allocate(shape.size);
+    try {
+      core.write(at, shape, { struct_size: shape.size });
+      core.functions.echospline_forced_defaults(at);
+      core.write(at, shape, options);
+      this.handle = core.create("forced", at);
+    } finally {
+      core.functions.free(at);
+    }
+    this.pose = core.allocate(LAYOUTS.echospline_pose.size);
+    this.field = core.allocate(8 * this.numbers);
+  }
+
+  /** Throw unless a call succeeded. @param {number} status */
+  check(status) {
+    this.core.check(status, "forced", this.handle);
+  }
+
+  /** Back to rest. */
+  reset() {
+    this.check(this.core.functions.echospline_forced_reset(this.handle));
+  }
+
+  /** Advance by one step. @param {Pose} pose */
+  advance(pose) {
+    const { functions } = this.core;
+    this.core.write(this.pose, LAYOUTS.echospline_pose, pose);
+    this.answered(() => functions.echospline_forced_advance(this.handle, this.pose));
+  }
+
+  /** Repeat a call until it needs no further station. @param {() => number} call */
+  answered(call) {
+    const { functions } = this.core;
+    const shape = LAYOUTS.echospline_station;
+    let status = call();
+    while (status === Status.NEEDS_STATION) {
+      const stations = this.stations();
+      const at = this.core.allocate(shape.size);
+      let [columns, rows] = [0, 0];
+      try {
+        this.check(functions.echospline_forced_wanted(this.handle, at));
+        const wanted = /** @type {any} */ (this.core.read(at, shape));
+        const given = this.answer(wanted, stations.slice(0, wanted.index));
+        columns = this.core.allocate(4 * given.columns.length);
+        new Float32Array(this.core.buffer, columns, given.columns.length).set(given.columns);
+        rows = this.core.place(given.rows);
+        const counts = [BigInt(given.columns.length), BigInt(given.rows.length)];
+        this.check(functions.echospline_forced_answer(this.handle, columns, counts[0], rows, counts[1]));
+      } finally {
+        for (const address of [at, columns, rows]) if (address) functions.free(address);
+      }
+      status = call();
+    }
+    this.check(status);
+  }
+
+  /** Stations that have been answered. @returns {Station[]} */
+  stations() {
+    const { functions } = this.core;
+    const shape = LAYOUTS.echospline_station;
+    const number = this.core.allocate(8);
+    let list = 0;
+    try {
+      this.check(functions.echospline_forced_stations(this.handle, 0, 0n, number));
+      const count = Number(new BigInt64Array(this.core.buffer, number, 1)[0]);
+      list = this.core.allocate(count * shape.size);
+      this.check(functions.echospline_forced_stations(this.handle, list, BigInt(count), number));
+      return Array.from({ length: count }, (_, i) => /** @type {any} */ (this.core.read(list + i * shape.size, shape)));
+    } finally {
+      functions.free(number);
+      functions.free(list);
+    }
+  }
+
+  /** The needle's forces. @returns {NeedleLoad} */
+  load() {
+    const shape = LAYOUTS.echospline_needle_load;
+    const at = this.core.allocate(shape.size);
+    try {
+      this.check(this.core.functions.echospline_forced_load(this.handle, at));
+      return /** @type {any} */ (this.core.read(at, shape));
+    } finally {
+      this.core.functions.free(at);
+    }
+  }
+
+  /** Force at every station, two numbers each, N. @returns {Float64Array} */
+  forces() {
+    const { functions } = this.core;
+    const number = this.core.allocate(8);
+    let list = 0;
+    try {
+      this.check(functions.echospline_forced_forces(this.handle, 0, 0n, number));
+      const count = Number(new BigInt64Array(this.core.buffer, number, 1)[0]);
+      list = this.core.allocate(16 * count);
+      this.check(functions.echospline_forced_forces(this.handle, list, BigInt(count), number));
+      return new Float64Array(this.core.buffer, list, 2 * count).slice();
+    } finally {
+      functions.free(number);
+      functions.free(list);
+    }
+  }
+
+  /** Displacement of the mesh nodes, two numbers each, mm: a view. @returns {Float64Array} */
+  displacement() {
+    const { functions } = this.core;
+    this.answered(() => functions.echospline_forced_displacement(this.handle, this.field, BigInt(this.numbers)));
+    return new Float64Array(this.core.buffer, this.field, this.numbers);
+  }
+
+  /** The same in single precision: a view. @returns {Float32Array} */
+  displacementSingle() {
+    const { functions } = this.core;
+    this.answered(() => functions.echospline_forced_displacement_single(this.handle, this.field, BigInt(this.numbers)));
+    return new Float32Array(this.core.buffer, this.field, this.numbers);
+  }
+
+  /** The present state as bytes. @returns {Uint8Array} */
+  save() {
+    const { functions } = this.core;
+    const size = Number(functions.echospline_forced_state_size(this.handle));
+    const at = this.core.allocate(size);
+    try {
+      this.check(functions.echospline_forced_state_save(this.handle, at, BigInt(size)));
+      return new Uint8Array(this.core.buffer, at, size).slice();
+    } finally {
+      functions.free(at);
+    }
+  }
+
+  /** Make saved bytes the present state. @param {Uint8Array} bytes */
+  restore(bytes) {
+    const { functions } = this.core;
+    const at = this.core.allocate(bytes.length);
+    try {
+      new Uint8Array(this.core.buffer, at, bytes.length).set(bytes);
+      this.check(functions.echospline_forced_state_load(this.handle, at, BigInt(bytes.length)));
+    } finally {
+      functions.free(at);
+    }
+  }
+
+  destroy() {
+    const { functions } = this.core;
+    functions.echospline_forced_destroy(this.handle);
+    functions.free(this.pose);
+    functions.free(this.field);
+    this.handle = this.pose = this.field = 0;
   }
 }
 

@@ -6,12 +6,9 @@ import json
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.table import Table
-from threadpoolctl import threadpool_limits
 
-from echospline.mechanics import describe_core
-from echospline.study import benchmark
+from echospline import mechanics
+from echospline import study as study_room
 
 
 def bench(
@@ -20,13 +17,17 @@ def bench(
     ] = False,
 ) -> None:
     """Time steps and frames on this machine, against the display's 60 Hz and the haptic 1 kHz; under a minute."""
+    from rich.console import Console
+    from rich.table import Table
+    from threadpoolctl import threadpool_limits
+
     say = Console(stderr=True, highlight=False)
     with say.status("…") as status, threadpool_limits(1):
-        rows = benchmark(status.update)
+        rows = study_room.benchmark(status.update)
     if as_json:
         print(json.dumps([row.as_json() for row in rows], indent=2))
         return
-    core = describe_core()
+    core = mechanics.describe_core()
     table = Table(box=None, pad_edge=False, title="times in ms; step: from needle pose to mesh displacement")
     table.add_column("what", no_wrap=True)
     for name in ("nodes", "median", "p99", "per s", "x limit", "60 Hz", "1 kHz"):

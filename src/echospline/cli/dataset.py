@@ -10,12 +10,12 @@ from time import perf_counter
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from echospline import scenario as scenario_room
+from echospline import study as study_room
+from echospline.atomic import claimed
+from echospline.cli.options import say
 from echospline.errors import InputError
-from echospline.scenario import load
-from echospline.study import Task, create_store, make_sample, sweep, write_summary
 
 
 def dataset(
@@ -42,32 +42,43 @@ def dataset(
     and `scenarios/0000000.toml` makes it again (`echospline phantom`). An interrupted run resumes,
     and a larger --n adds samples.
     """
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
     with as_file(files("echospline").joinpath("data", "dataset.toml")) as own:
         bases = [str(path.resolve()) for path in scenarios or [own]]
-        shapes = {(s.phantom.grid().shape, s.mesh.nodes) for s in map(load, map(Path, bases))}
+        shapes = {(s.phantom.grid().shape, s.mesh.nodes) for s in map(scenario_room.load, map(Path, bases))}
+        for base in bases:
+            first = scenario_room.load(Path(base))
+            say(scenario_room.needle_doubts(first.insertion(), first.phantom.grid()))
+        (nx, ny), (mx, my) = next(iter(shapes))
         if len(shapes) > 1:
             raise InputError(
                 "all bases of a dataset need the same phantom.size, phantom.pixel and mesh.nodes"
             )
+        say(scenario_room.check_store(n, frames * (2 * nx * ny + 8 * mx * my + 48), out))
         began = perf_counter()
-        # names, not paths: the dataset is the same wherever it is made
-        create_store(out, load(Path(bases[0])), n, frames, seed, [Path(b).name for b in bases])
-        tasks = [
-            Task(
-                f"{i:07d}",
-                {"store": str(out.resolve()), "bases": bases, "index": i, "seed": seed, "frames": frames},
+        with claimed(out):
+            # names, not paths: the dataset is the same wherever it is made
+            study_room.create_store(
+                out, scenario_room.load(Path(bases[0])), n, frames, seed, [Path(b).name for b in bases]
             )
-            for i in range(n)
-        ]
-        with Progress(
-            TextColumn("samples"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
-            console=Console(stderr=True), transient=True, disable=json_,
-        ) as bar:  # fmt: skip
-            line = bar.add_task("samples", total=n)
-            outcome = sweep(
-                make_sample, tasks, out / "tasks", workers=workers, scheduler=scheduler,
-                report=lambda name: bar.advance(line),
-            )  # fmt: skip
+            tasks = [
+                study_room.Task(
+                    f"{i:07d}",
+                    {"store": str(out.resolve()), "bases": bases, "index": i, "seed": seed, "frames": frames},
+                )
+                for i in range(n)
+            ]
+            with Progress(
+                TextColumn("samples"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+                console=Console(stderr=True), transient=True, disable=json_,
+            ) as bar:  # fmt: skip
+                line = bar.add_task("samples", total=n)
+                outcome = study_room.sweep(
+                    study_room.make_sample, tasks, out / "tasks", workers=workers, scheduler=scheduler,
+                    report=lambda name: bar.advance(line),
+                )  # fmt: skip
         seconds = perf_counter() - began
     made = n - outcome.resumed - len(outcome.failed)
     report = {
@@ -79,7 +90,7 @@ def dataset(
         "samples_per_second": made / seconds,
         "largest_mm": max((r["largest_mm"] for r in outcome.results.values()), default=0.0),
     }
-    write_summary(out, report)
+    study_room.write_summary(out, report)
     if json_:
         json.dump(report, sys.stdout, indent=1)
         print()

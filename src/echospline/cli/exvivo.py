@@ -9,42 +9,19 @@ from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
-from rich.console import Console
-from rich.progress import track as counted
-from rich.table import Table
 
-from echospline.atomic import give_name, part_of, writing
+from echospline import io as io_room
+from echospline import laboratory, mechanics
+from echospline import picture as picture_room
+from echospline import scenario as scenario_room
+from echospline import scene as scene_room
+from echospline import study as study_room
+from echospline.atomic import appearing, claimed
+from echospline.cli.options import say
 from echospline.cli.phantom import phantom_into
 from echospline.cli.track import load, tracker
 from echospline.errors import InputError
-from echospline.io import read_displacement, read_needle
-from echospline.laboratory import Displacement, displacement_of
-from echospline.mechanics import FEMModel, GreenModel, TPSModel
-from echospline.picture import Deformation
-from echospline.scenario import Scenario, build_model
-from echospline.scenario import load as load_scenario
-from echospline.scene import Cine, EchoCine, Insertion, RegularGrid
-from echospline.study import (
-    PRINTED,
-    Fit,
-    ForceFields,
-    Observation,
-    Regions,
-    SplineFields,
-    UnitFields,
-    compared,
-    error_per_depth,
-    figure,
-    fit,
-    motion_maps,
-    paragraph,
-    regions,
-    table,
-    tracker_error,
-    write_report,
-)
 
 KINDS = ("tps", "elastic", "fem")
 
@@ -92,26 +69,33 @@ def exvivo(
     and finite elements are fitted to it separately (RMSE), compared frame by frame with a paired test, and used to
     predict depths outside the fit. On the phantom the truth is known, and the tracker's own error is reported too.
     """
+    import numpy as np
+
     if (cine is None) != (needle is None):
         raise InputError("--cine and --needle belong together: where the needle is in every frame")
     scene, folder = _scene(scenario)
     truth_file = None
     if cine is None:
         phantom_into(scene, out / "phantom", folder, echoes=True, quiet=json_)
-        frames: Cine | EchoCine = load(str(out / "phantom" / "echoes.npz"))
-        if b_mode and isinstance(frames, EchoCine):
+        frames: scene_room.Cine | scene_room.EchoCine = load(str(out / "phantom" / "echoes.npz"))
+        if b_mode and isinstance(frames, scene_room.EchoCine):
             display, grid = scene.phantom.display(), scene.phantom.grid()
             pictures = np.stack([echo.b_mode(display, grid).pixels for echo in frames])
-            frames = Cine(pictures, frames.times, grid, "speckle phantom")
+            frames = scene_room.Cine(pictures, frames.times, grid, "speckle phantom")
         truth_file = out / "phantom" / "displacement.npz"
         insertion = scene.insertion()
     else:
         frames = load(cine, spacing=spacing, fps=fps, crop=crop, rf=rf)
-        insertion = read_needle(needle) if needle is not None else scene.insertion()
-    result = study_exvivo(
-        frames, insertion, scene, folder, out, truth_file=truth_file, method=method, depths=depths,
-        distance=distance, seed=seed, quiet=json_, source=cine or "phantom driven by finite elements",
-    )  # fmt: skip
+        insertion = io_room.read_needle(needle) if needle is not None else scene.insertion()
+    say(
+        scenario_room.size_doubts(frames.grid, "--spacing")
+        + scenario_room.needle_doubts(insertion, frames.grid)
+    )
+    with claimed(out):
+        result = study_exvivo(
+            frames, insertion, scene, folder, out, truth_file=truth_file, method=method, depths=depths,
+            distance=distance, seed=seed, quiet=json_, source=cine or "phantom driven by finite elements",
+        )  # fmt: skip
     if json_:
         json.dump(result, sys.stdout, indent=1)
         print()
@@ -120,9 +104,9 @@ def exvivo(
 
 
 def study_exvivo(
-    frames: Cine | EchoCine,
-    insertion: Insertion,
-    scene: Scenario,
+    frames: scene_room.Cine | scene_room.EchoCine,
+    insertion: scene_room.Insertion,
+    scene: scenario_room.Scenario,
     folder: Path,
     out: Path,
     *,
@@ -135,69 +119,82 @@ def study_exvivo(
     source: str,
 ) -> dict[str, Any]:
     """Track, fit, test, draw and write the report; returns the content of ``exvivo.json``."""
+    from rich.console import Console
+    from rich.progress import track as counted
+
     wrap: Callable[[Any], Any] = (
         iter
         if quiet
         else lambda it: counted(list(it), "tracking", console=Console(stderr=True), transient=True)
     )
-    seen = regions(
+    seen = study_room.regions(
         frames, insertion, tracker(method), depths=depths, distance=distance, progress=wrap
     )  # fmt: skip
     truth = None if truth_file is None else _truth(truth_file, seen)
-    mesh = RegularGrid.covering(frames.grid, scene.mesh.nodes)
+    mesh = scene_room.RegularGrid.covering(frames.grid, scene.mesh.nodes)
     models = {kind: _fields(scene, folder, mesh, kind) for kind in KINDS}
-    fits = {kind: fit(seen, model, truth, seed=seed) for kind, model in models.items()}
-    wide = {kind: fit(seen, model, truth, where="field", seed=seed) for kind, model in models.items()}
+    fits = {kind: study_room.fit(seen, model, truth, seed=seed) for kind, model in models.items()}
+    wide = {
+        kind: study_room.fit(seen, model, truth, where="field", seed=seed) for kind, model in models.items()
+    }
     result = _result(seen, fits, truth, source) | {
         "fitted to the whole field": {
             "means": _result(seen, wide, truth, source)["means"],
             "parameters": {kind: f.values for kind, f in wide.items()},
         }
     }
-    with writing(out):
-        out.mkdir(parents=True, exist_ok=True)
-    own = None if truth is None else tracker_error(seen, truth)
+    own = None if truth is None else study_room.tracker_error(seen, truth)
     depth = [pose.depth for pose in seen.poses]
-    error_per_depth(
+    study_room.error_per_depth(
         depth,
         {k: f.rmse for k, f in fits.items()},
         {k: f.held_out for k, f in fits.items()},
         own,
         out / "fig_5a",
     )
-    motion_maps(seen, {k: f.map for k, f in fits.items()}, out / "fig_5bc")
-    motion_maps(seen, {k: f.map for k, f in wide.items()}, out / "maps_whole_field")
+    study_room.motion_maps(seen, {k: f.map for k, f in fits.items()}, out / "fig_5bc")
+    study_room.motion_maps(seen, {k: f.map for k, f in wide.items()}, out / "maps_whole_field")
     _write(out, result)
     return result
 
 
-def _scene(path: Path | None) -> tuple[Scenario, Path]:
+def _scene(path: Path | None) -> tuple[scenario_room.Scenario, Path]:
     if path is not None:
-        return load_scenario(path), path.resolve().parent
+        return scenario_room.load(path), path.resolve().parent
     with as_file(files("echospline").joinpath("data", "exvivo.toml")) as inside:
-        return load_scenario(inside), Path.cwd()
+        return scenario_room.load(inside), Path.cwd()
 
 
 def _fields(
-    scene: Scenario, folder: Path, mesh: RegularGrid, kind: str
-) -> Callable[[Observation], UnitFields]:
+    scene: scenario_room.Scenario, folder: Path, mesh: scene_room.RegularGrid, kind: str
+) -> Callable[[study_room.Observation], study_room.UnitFields]:
     """Build the unit fields of the model of that name; its laws are those linear in the parameters."""
-    built = build_model(scene.with_values({**PRINTED, "model.kind": kind}), mesh, folder=folder)
-    if isinstance(built, TPSModel):
-        return lambda seen: SplineFields(built, seen)
-    if isinstance(built, FEMModel | GreenModel):
-        return lambda seen: ForceFields(built, seen)
+    built = scenario_room.build_model(
+        scene.with_values({**study_room.PRINTED, "model.kind": kind}), mesh, folder=folder
+    )
+    if isinstance(built, mechanics.TPSModel):
+        return lambda seen: study_room.SplineFields(built, seen)
+    if isinstance(built, mechanics.FEMModel | mechanics.GreenModel):
+        return lambda seen: study_room.ForceFields(built, seen)
     raise InputError(f"{kind} has no parameters to identify")
 
 
-def _truth(path: Path, seen: Regions) -> list[Displacement]:
-    record = read_displacement(path)
-    return [displacement_of(Deformation(record.grid(), record.displacement[k])) for k in seen.frames]
+def _truth(path: Path, seen: study_room.Regions) -> list[laboratory.Displacement]:
+    record = io_room.read_displacement(path)
+    return [
+        laboratory.displacement_of(picture_room.Deformation(record.grid(), record.displacement[k]))
+        for k in seen.frames
+    ]
 
 
 def _result(
-    seen: Regions, fits: Mapping[str, Fit], truth: Sequence[Displacement] | None, source: str
+    seen: study_room.Regions,
+    fits: Mapping[str, study_room.Fit],
+    truth: Sequence[laboratory.Displacement] | None,
+    source: str,
 ) -> dict[str, Any]:
+    import numpy as np
+
     rows = []
     for i, pose in enumerate(seen.poses):
         size = np.hypot(*seen.displacement[i].T)
@@ -210,7 +207,7 @@ def _result(
         row |= {f"{kind}_rmse_mm": float(f.rmse[i]) for kind, f in fits.items()}
         row |= {f"{kind}_held_out_mm": f.held_out[i] for kind, f in fits.items()}
         if truth is not None:
-            row["tracker_rmse_mm"] = float(tracker_error(seen, truth)[i])
+            row["tracker_rmse_mm"] = float(study_room.tracker_error(seen, truth)[i])
             row |= {f"{kind}_held_out_true_mm": f.held_out_true[i] for kind, f in fits.items()}
             row |= {f"{kind}_held_out_field_mm": f.held_out_field[i] for kind, f in fits.items()}
         rows.append(row)
@@ -224,16 +221,14 @@ def _result(
         "rows": rows,
         "means": means,
         "parameters": {kind: f.values for kind, f in fits.items()},
-        "paired": compared(fits),
+        "paired": study_room.compared(fits),
     }
 
 
 def _write(out: Path, result: Mapping[str, Any]) -> None:
     path = out / "exvivo.json"
-    with writing(path):
-        part = part_of(path)
+    with appearing(path) as part:
         part.write_text(json.dumps(result, indent=1), encoding="utf-8")
-        give_name(part, path)
     rows = result["rows"]
     known = "tracker_rmse_mm" in rows[0]
     columns = {
@@ -260,32 +255,32 @@ def _write(out: Path, result: Mapping[str, Any]) -> None:
         "pair": "models", "what": "RMSE of", "frames": "frames", "mean_difference_mm": "mean difference, mm",
         "low": "95 % from", "high": "to", "p_t": "p, paired t", "p_wilcoxon": "p, Wilcoxon",
     }  # fmt: skip
-    write_report(
+    study_room.write_report(
         out / "report.html",
         "Ex-vivo protocol: tracked motion ahead of the tip against fitted models",
         [
             ("What was done", [
-                paragraph(f"Source: {result['source']}. A region of 200 points in 2 x 3 mm travels ahead of the tip; its "
+                study_room.paragraph(f"Source: {result['source']}. A region of 200 points in 2 x 3 mm travels ahead of the tip; its "
                           "motion since the first frame is tracked at each depth. Every model is fitted to all depths by least "
                           "RMSE. 'Unseen' is the prediction at a depth by a fit to the depths of the other parity."),
             ]),
-            ("Error per depth (Fig. 5a)", [table([result["means"]], {c: h for c, h in columns.items() if c in result["means"]}),
-                                             table(rows, columns), figure(out / "fig_5a.png", "RMSE per insertion depth")]),
+            ("Error per depth (Fig. 5a)", [study_room.table([result["means"]], {c: h for c, h in columns.items() if c in result["means"]}),
+                                             study_room.table(rows, columns), study_room.figure(out / "fig_5a.png", "RMSE per insertion depth")]),
             ("Do the models differ?", [
-                table(tests, test_columns),
-                paragraph("A large p does not show that two models are the same; the interval says how far apart they may be."),
+                study_room.table(tests, test_columns),
+                study_room.paragraph("A large p does not show that two models are the same; the interval says how far apart they may be."),
             ]),
             ("Displacement maps (Fig. 5b, c)", [
-                figure(out / "fig_5bc.png", "Axial displacement, tracked, and of the models fitted to the region alone"),
-                paragraph("A fit to the region says nothing of the rest of the picture: look at the maps before believing it."),
+                study_room.figure(out / "fig_5bc.png", "Axial displacement, tracked, and of the models fitted to the region alone"),
+                study_room.paragraph("A fit to the region says nothing of the rest of the picture: look at the maps before believing it."),
             ]),
             ("Fitted to the whole tracked field", [
-                table(_summary(result["fitted to the whole field"]["means"]), SUMMARY),
-                figure(out / "maps_whole_field.png", "The same with models fitted to every trusted point of the picture"),
-                table([{"model": k} | v for k, v in result["fitted to the whole field"]["parameters"].items()],
+                study_room.table(_summary(result["fitted to the whole field"]["means"]), SUMMARY),
+                study_room.figure(out / "maps_whole_field.png", "The same with models fitted to every trusted point of the picture"),
+                study_room.table([{"model": k} | v for k, v in result["fitted to the whole field"]["parameters"].items()],
                       {"model": "model"} | {n: n for v in result["parameters"].values() for n in v}),
             ]),
-            ("Parameters of the fits to the region", [table([{"model": k} | v for k, v in result["parameters"].items()],
+            ("Parameters of the fits to the region", [study_room.table([{"model": k} | v for k, v in result["parameters"].items()],
                                   {"model": "model"} | {n: n for v in result["parameters"].values() for n in v})]),
         ],
     )  # fmt: skip
@@ -312,6 +307,9 @@ def _summary(means: Mapping[str, float]) -> list[dict[str, Any]]:
 
 
 def _print_summary(result: Mapping[str, Any], out: Path) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
     console = Console()
     means = result["means"]
     for title, numbers in (

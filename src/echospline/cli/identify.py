@@ -8,11 +8,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
+from echospline import study as study_room
 from echospline.errors import InputError
-from echospline.study import Task, calibrate, sweep
 
 
 def identify(
@@ -69,6 +67,9 @@ def identify(
     that the data do not determine) and `error_map.png`. Several fields run one after another, on `--workers` or on a cluster;
     each result is written as soon as its task ends, and an interrupted run resumes.
     """
+    for field in fields:
+        if not Path(field).exists():
+            raise InputError(f"there is no file or folder {field}: expected a displacement field or a run")
     names = _names(fields)
     tasks = []
     for name, field in zip(names, fields, strict=True):
@@ -79,12 +80,14 @@ def identify(
             "needle": None if needle is None else str(needle.resolve()), "confidence": confidence,
             "method": method, "frames": frames, "runs": runs, "bootstrap": bootstrap, "seed": seed,
         }  # fmt: skip
-        tasks.append(Task(name, arguments))
+        tasks.append(study_room.Task(name, arguments))
     if len(tasks) == 1 and not workers and scheduler is None:
-        reports = {names[0]: calibrate(**tasks[0].arguments)}
+        reports = {names[0]: study_room.calibrate(**tasks[0].arguments)}
         failed: dict[str, str] = {}
     else:
-        outcome = sweep(calibrate, tasks, out / "tasks", workers=workers, scheduler=scheduler)
+        outcome = study_room.sweep(
+            study_room.calibrate, tasks, out / "tasks", workers=workers, scheduler=scheduler
+        )
         reports, failed = outcome.results, outcome.failed
     if json_:
         json.dump({"reports": reports, "failed": failed}, sys.stdout, indent=1)
@@ -109,6 +112,9 @@ def _names(fields: list[str]) -> list[str]:
 
 
 def _print_summary(reports: dict[str, Any], out: Path) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
     console = Console()
     for name, report in reports.items():
         table = Table(title=f"{name}: {report['model']}, {report['method']}", title_justify="left")

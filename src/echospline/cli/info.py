@@ -10,9 +10,8 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from rich.console import Console
-from rich.table import Table
 
+from echospline import scenario as scenario_room
 from echospline.errors import InputError
 from echospline.io import (
     LIMIT,
@@ -26,7 +25,7 @@ from echospline.io import (
     read_displacement,
     sample_image,
 )
-from echospline.scenario import LARGEST_FILE, Scenario, load
+from echospline.scene import RegularGrid
 
 
 def info(
@@ -48,6 +47,9 @@ def info(
     ] = LIMIT,
 ) -> None:
     """Describe a file: format, pixels, spacing, size in mm, frames and times, and doubts."""
+    from rich.console import Console
+    from rich.table import Table
+
     found = describe(file, limit)
     if as_json:
         print(json.dumps(found, indent=2))
@@ -137,8 +139,22 @@ def _of_recording(recording: Recording) -> dict[str, Any]:
             {"content": r.content, "box": list(r.box), "spacing_mm": list(r.spacing) if r.spacing else None}
             for r in recording.regions
         ]
-    about["notes"] = [*recording.notes, *_missing(recording)]
+    about["notes"] = [
+        *recording.notes,
+        *_missing(recording),
+        *_size_doubts(right - left, bottom - top, recording),
+    ]
     return about
+
+
+def _size_doubts(columns: int, rows: int, recording: Recording) -> list[str]:
+    """Return what other commands say of the picture's size, or refuse it for."""
+    if recording.spacing is None:
+        return []
+    try:
+        return scenario_room.size_doubts(RegularGrid((columns, rows), recording.spacing))
+    except InputError as error:
+        return [str(error)]
 
 
 def _missing(recording: Recording) -> list[str]:
@@ -176,17 +192,19 @@ def _of_displacement(path: Path, limit: float) -> dict[str, Any]:
 
 def _of_toml(path: Path) -> dict[str, Any]:
     """Describe a scenario; of another TOML file, list its tables."""
-    if path.stat().st_size > LARGEST_FILE:
-        raise InputError(f"{path} has {path.stat().st_size:,} bytes; a scenario has {LARGEST_FILE:,} at most")
+    if path.stat().st_size > scenario_room.LARGEST_FILE:
+        raise InputError(
+            f"{path} has {path.stat().st_size:,} bytes; a scenario has {scenario_room.LARGEST_FILE:,} at most"
+        )
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path} is no valid TOML: {' '.join(str(error).split())}") from error
-    if not set(document) & set(Scenario.model_fields):
+    if not set(document) & set(scenario_room.Scenario.model_fields):
         return {"format": "TOML, no scenario", "tables": _tables(document), "notes": []}
     about: dict[str, Any] = {"format": "TOML scenario", "tables": _tables(document), "notes": []}
     try:
-        run = load(path)
+        run = scenario_room.load(path)
     except InputError as error:
         about["notes"].append(f"cannot be run: {error}")
     else:

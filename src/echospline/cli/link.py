@@ -9,25 +9,14 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
-from threadpoolctl import threadpool_limits
 
-from echospline.cli.options import scenario_from, with_scenario_options
+from echospline import live as live_room
+from echospline import openigtlink
+from echospline import scenario as scenario_room
+from echospline import scene as scene_room
+from echospline.cli.options import say, scenario_from, with_scenario_options
 from echospline.errors import InputError
-from echospline.live import LiveEngine
-from echospline.openigtlink import (
-    PORT,
-    Looks,
-    Naming,
-    Rates,
-    Session,
-    SessionOptions,
-    Stage,
-    read_calibration,
-)
-from echospline.scenario import MODELS, Scenario, build_model, load
-from echospline.scene import NeedlePose, Reach, UltrasoundImage
 
 AXES = {
     "x": (1.0, 0.0, 0.0), "-x": (-1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0),
@@ -47,7 +36,7 @@ def link(
     ] = "sample:calf",
     port: Annotated[
         int, typer.Option(min=0, max=65535, help="port to listen on; 0 takes any free one")
-    ] = PORT,
+    ] = openigtlink.PORT,
     host: Annotated[
         str,
         typer.Option(help="address to listen on; OpenIGTLink knows no password, so trusted networks only"),
@@ -124,6 +113,17 @@ def link(
         Path | None,
         typer.Option(metavar="FOLDER", help="scenarios that peers may load by name; without, none"),
     ] = None,
+    silence: Annotated[
+        float,
+        typer.Option(metavar="S", help="seconds without a transform after which the needle counts as stale"),
+    ] = 0.5,
+    ask: Annotated[
+        str,
+        typer.Option(
+            metavar="TYPE",
+            help="stream that servers of --connect are asked to start: TDATA, QTDATA, QTRANS, POSITION or none",
+        ),
+    ] = "TDATA",
     duration: Annotated[
         float, typer.Option(metavar="S", min=0, help="end after so many seconds; 0 runs until Ctrl+C")
     ] = 0.0,
@@ -134,37 +134,46 @@ def link(
 
     Images go out at the scenario's frames per second (--fps). docs/slicer.md shows how to connect step by step.
     """
+    from threadpoolctl import threadpool_limits
+
     logging.basicConfig(
         level=logging.WARNING if quiet else logging.INFO, format="%(message)s", stream=sys.stderr, force=True
     )
     scenario, folder = scenario_from(source, changes or {})
-    naming = Naming(
+    naming = openigtlink.Naming(
         needles=tuple(needle_frame) if needle_frame else ("NeedleTip", "StylusTip"),
         reference=reference,
         image=image_name,
         axis=axis_of(needle_axis),
-        calibration=read_calibration(config) if config else {},
+        calibration=openigtlink.read_calibration(config) if config else {},
     )
-    options = SessionOptions(
+    options = openigtlink.SessionOptions(
         host=host if serve else "",
         port=port,
         connect=tuple(address(text) for text in connect or ()),
-        looks=Looks(naming, embed, scenario.needle_echo()),
-        reach=Reach(thickness=beam, contact=contact),
-        rates=Rates(scenario.output.fps, mesh_rate),
+        looks=openigtlink.Looks(naming, embed, scenario.needle_echo()),
+        reach=scene_room.Reach(thickness=beam, contact=contact),
+        rates=openigtlink.Rates(scenario.output.fps, mesh_rate),
+        silence=silence,
+        ask="" if ask.lower() == "none" else ask.upper(),
     )
     if not options.host and not options.connect:
         raise InputError("nothing to do: with --no-serve give --connect HOST:PORT")
     stage = make_stage(scenario, folder, orientation, rate, [_point(text) for text in target or ()])
 
-    def load_named(name: str) -> Stage:
+    say(scenario_room.size_doubts(stage.image.grid))
+
+    def load_named(name: str) -> openigtlink.Stage:
         assert scenarios is not None  # otherwise it is not passed on
         if Path(name).name != name or not name.endswith(".toml"):
             raise InputError(f"a scenario is named NAME.toml, without folders; got {name!r}")
-        return make_stage(load(scenarios / name), scenarios, orientation, rate, [])
+        return make_stage(scenario_room.load(scenarios / name), scenarios, orientation, rate, [])
 
     # An engine's step is short: more threads make it slower and less punctual.
-    with threadpool_limits(limits=1), Session(stage, options, load_named if scenarios else None) as session:
+    with (
+        threadpool_limits(limits=1),
+        openigtlink.Session(stage, options, load_named if scenarios else None) as session,
+    ):
         if not quiet:
             where = f"OpenIGTLink on {host}:{session.port}" if serve else "OpenIGTLink"
             print(f"{where}: {_summary(stage)}; Ctrl+C ends", flush=True)
@@ -175,12 +184,12 @@ def link(
 
 
 def make_stage(
-    scenario: Scenario,
+    scenario: scenario_room.Scenario,
     folder: Path,
     orientation: str = "MF",
     rate: float = 120.0,
     targets: list[tuple[float, float]] | None = None,
-) -> Stage:
+) -> openigtlink.Stage:
     """Build the image, tissue and needle of a scenario, ready to run live.
 
     Parameters
@@ -196,22 +205,24 @@ def make_stage(
     targets : list of (x, y)
         Points whose motion is reported, mm.
     """
+    import numpy as np
+
     image = oriented(scenario.read_image(folder), orientation)
     grid = scenario.grid(image)
     insertion = scenario.insertion()
     entry = (float(insertion.entry[0, 0]), float(insertion.entry[0, 1]))
-    engine = LiveEngine(
-        lambda kind: build_model(scenario, grid, kind=kind, folder=folder),
+    engine = live_room.LiveEngine(
+        lambda kind: scenario_room.build_model(scenario, grid, kind=kind, folder=folder),
         scenario.model.kind,
-        NeedlePose(entry, entry),
+        scene_room.NeedlePose(entry, entry),
         rate=rate,
     )
     if targets:
         engine.watch(np.array(targets))
-    return Stage(image, engine, MODELS, insertion)
+    return openigtlink.Stage(image, engine, scenario_room.MODELS, insertion)
 
 
-def oriented(image: UltrasoundImage, orientation: str) -> UltrasoundImage:
+def oriented(image: scene_room.UltrasoundImage, orientation: str) -> scene_room.UltrasoundImage:
     """Turn a picture of another orientation to MF: columns to the marked side, rows away from the probe.
 
     Raises
@@ -219,6 +230,8 @@ def oriented(image: UltrasoundImage, orientation: str) -> UltrasoundImage:
     InputError
         If there is no such orientation.
     """
+    import numpy as np
+
     if orientation not in ORIENTATIONS:
         raise InputError(f"--orientation is one of {', '.join(ORIENTATIONS)}; got {orientation!r}")
     pixels = image.pixels
@@ -226,10 +239,10 @@ def oriented(image: UltrasoundImage, orientation: str) -> UltrasoundImage:
         pixels = pixels[:, ::-1]
     if orientation[1] == "N":
         pixels = pixels[::-1]
-    return UltrasoundImage(np.ascontiguousarray(pixels), image.grid, image.source)
+    return scene_room.UltrasoundImage(np.ascontiguousarray(pixels), image.grid, image.source)
 
 
-def _summary(stage: Stage) -> str:
+def _summary(stage: openigtlink.Stage) -> str:
     x0, x1, y0, y1 = stage.image.grid.extent
     newest = stage.engine.snapshots.latest()
     name = newest.value.model if newest else ""
@@ -246,7 +259,7 @@ def address(text: str) -> tuple[str, int]:
     """
     host, colon, port = text.rpartition(":")
     if not colon:
-        return text, PORT
+        return text, openigtlink.PORT
     if not host or not port.isdigit() or not 0 < int(port) < 65536:
         raise InputError(f"--connect expects HOST:PORT; got {text!r}")
     return host, int(port)

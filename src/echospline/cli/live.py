@@ -8,28 +8,53 @@ import webbrowser
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from threadpoolctl import threadpool_limits
 
+from echospline import io as io_room
+from echospline import openigtlink, viewer
+from echospline import picture as picture_room
+from echospline import scenario as scenario_room
+from echospline import scene as scene_room
 from echospline.cli.link import address, make_stage
-from echospline.cli.options import scenario_from, with_scenario_options
+from echospline.cli.options import say, scenario_from, with_scenario_options
 from echospline.errors import InputError
-from echospline.openigtlink import PORT, Looks, Naming, Rates, Session, SessionOptions, read_calibration
-from echospline.picture import NeedleEcho
-from echospline.scenario import MODELS, Scenario, build_model
-from echospline.scene import UltrasoundImage
-from echospline.viewer import Scene, Sessions, Settings, build_app, default_exercises, serve, steer
 
+LARGEST_UPLOAD = 256.0
+"""MiB of one decoded frame; 4096 x 4096 pixels, the most that a page shows, have 128 in double precision."""
 LABELS = {"tps": "TPS", "elastic": "Elastic", "green": "Green", "fem": "FEM"}
 
 
 def default_sessions() -> Path:
-    """Return the file that keeps a user's training sessions."""
-    home = os.environ.get("XDG_DATA_HOME") or str(Path.home() / ".local" / "share")
-    return Path(home) / "echospline" / "sessions.sqlite"
+    """Return the file that keeps a user's training sessions.
+
+    Raises
+    ------
+    InputError
+        If the user has no home.
+    """
+    named = os.environ.get("XDG_DATA_HOME")
+    try:
+        folder = Path(named) if named else Path.home() / ".local" / "share"
+    except RuntimeError:
+        raise InputError(
+            "this user has no home folder to keep sessions in; name a file with --sessions"
+        ) from None
+    return folder / "echospline" / "sessions.sqlite"
+
+
+def _kept(sessions: Path | None, stack: ExitStack, say: Callable[[str], None]) -> viewer.Sessions:
+    """Open the file of sessions; where no file was named and the user's cannot be written, one that lasts as long as the server."""
+    if sessions is not None:
+        return viewer.Sessions(sessions)
+    try:
+        return viewer.Sessions(default_sessions())
+    except InputError as error:
+        say(f"{error}; without one, sessions last until this server ends")
+        folder = stack.enter_context(TemporaryDirectory(prefix="echospline-", ignore_cleanup_errors=True))
+        return viewer.Sessions(Path(folder) / "sessions.sqlite")
 
 
 @with_scenario_options
@@ -70,7 +95,7 @@ def live(
     ] = False,
     link_port: Annotated[
         int, typer.Option(min=0, max=65535, help="port for it on this machine; 0 takes any free one")
-    ] = PORT,
+    ] = openigtlink.PORT,
     link_connect: Annotated[
         list[str] | None,
         typer.Option(metavar="HOST:PORT", help="an OpenIGTLink server to connect to; may be repeated"),
@@ -78,6 +103,24 @@ def live(
     link_config: Annotated[
         Path | None, typer.Option(metavar="FILE.xml", help="PLUS device set file with the calibration")
     ] = None,
+    link_silence: Annotated[
+        float,
+        typer.Option(metavar="S", help="seconds without a transform after which the tracker counts as stale"),
+    ] = 0.5,
+    origin: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="https://HOST",
+            help="address of a reverse proxy in front, as browsers see it; may be repeated; asks pages for a token",
+        ),
+    ] = None,
+    token: Annotated[
+        bool,
+        typer.Option(
+            "--token/--no-token",
+            help="ask pages for a token where others can reach them; without, the proxy must",
+        ),
+    ] = True,
     changes: dict[str, Any] | None = None,
 ) -> None:
     """Steer the needle in the browser and see the tissue move.
@@ -85,13 +128,17 @@ def live(
     Starts a server on this machine and opens its page; Ctrl+C ends it. Without an argument it shows the image that ships
     with the package. Finished exercises are kept (`echospline sessions` lists and exports them).
     """
+    from rich.console import Console
+    from threadpoolctl import threadpool_limits
+
     scenario, folder = scenario_from(source, changes or {})
     image = scenario.read_image(folder)
+    say(scenario_room.size_doubts(image.grid))
     scene = scene_of(scenario, image, folder)
-    settings = Settings(host, port, rate, clients, nodes=nodes)
-    kept = Sessions(sessions or default_sessions())
+    settings = viewer.Settings(
+        host, port, rate, clients, nodes=nodes, origins=tuple(origin or ()), open_door=not token
+    )
     scene.models(scene.names[0][0])  # refuses an invalid scenario before a page waits for it
-    app = build_app(scene, kept, settings, opener_for(scenario))
     console = Console(stderr=True)
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
 
@@ -102,29 +149,36 @@ def live(
             webbrowser.open(address)
 
     with ExitStack() as stack:
-        stack.enter_context(
-            threadpool_limits(limits=1)
-        )  # an engine's step is short: more threads make it slower and less punctual
+        kept = _kept(sessions, stack, lambda text: console.print(text, highlight=False, soft_wrap=True))
+        app = viewer.build_app(scene, kept, settings, opener_for(scenario))
+        # an engine's step is short: more threads make it slower and less punctual
+        stack.enter_context(threadpool_limits(limits=1))
         if link or link_connect:
-            session = Session(
+            session = openigtlink.Session(
                 make_stage(scenario, folder, rate=rate),
-                SessionOptions(
+                openigtlink.SessionOptions(
                     port=link_port,
                     connect=tuple(address(text) for text in link_connect or ()),
-                    looks=Looks(
-                        Naming(calibration=read_calibration(link_config) if link_config else {}),
+                    looks=openigtlink.Looks(
+                        openigtlink.Naming(
+                            calibration=openigtlink.read_calibration(link_config) if link_config else {}
+                        ),
                         echo=scenario.needle_echo(),
                     ),
-                    rates=Rates(scenario.output.fps),
+                    rates=openigtlink.Rates(scenario.output.fps),
+                    silence=link_silence,
                 ),
-                moved=lambda pose, appears: steer(app, pose, appears),
+                moved=lambda pose, appears: viewer.steer(app, pose, appears),
+                tracked=lambda text: viewer.announce(app, text),
             )
             stack.enter_context(session)
             console.print(f"OpenIGTLink on 127.0.0.1:{session.port}", highlight=False)
-        serve(app, settings, ready)
+        viewer.serve(app, settings, ready)
 
 
-def scene_of(scenario: Scenario, image: UltrasoundImage, folder: Path) -> Scene:
+def scene_of(
+    scenario: scenario_room.Scenario, image: scene_room.UltrasoundImage, folder: Path
+) -> viewer.Scene:
     """Build the scene of a scenario: its image, mesh and needle, every model, its exercises or the default three.
 
     Raises
@@ -144,33 +198,39 @@ def scene_of(scenario: Scenario, image: UltrasoundImage, folder: Path) -> Scene:
     kept = scenario.model_copy(
         update={"image": scenario.image.model_copy(update={"file": _whole(scenario, folder)})}
     )
-    return Scene(
+    return viewer.Scene(
         title=scenario.title or scenario.image.file.replace("sample:", "Sample: ").rsplit("/", 1)[-1],
         image=image,
         grid=grid,
-        models=lambda kind: build_model(scenario, grid, kind=kind, folder=folder),
-        names=tuple((kind, LABELS[kind]) for kind in sorted(MODELS, key=lambda kind: kind != first)),
+        models=lambda kind: scenario_room.build_model(scenario, grid, kind=kind, folder=folder),
+        names=tuple(
+            (kind, LABELS[kind]) for kind in sorted(scenario_room.MODELS, key=lambda kind: kind != first)
+        ),
         entry=entry,
         angle=angle,
-        echo=scenario.needle_echo() or NeedleEcho(shaft=False, tip=False, tail=False, shadow=False),
-        exercises=tuple(scenario.exercise) or default_exercises(grid),
+        echo=scenario.needle_echo()
+        or picture_room.NeedleEcho(shaft=False, tip=False, tail=False, shadow=False),
+        exercises=tuple(scenario.exercise) or viewer.default_exercises(grid),
         source=kept.model_dump_json(),
     )
 
 
-def _whole(scenario: Scenario, folder: Path) -> str:
+def _whole(scenario: scenario_room.Scenario, folder: Path) -> str:
     """Return the name of the image that is valid in every folder."""
     file = scenario.image.file
     return file if file.startswith("sample:") else str((folder / file).resolve())
 
 
-def opener_for(scenario: Scenario) -> Callable[[Path, tuple[float, float] | None], Scene]:
+def opener_for(
+    scenario: scenario_room.Scenario,
+) -> Callable[[Path, tuple[float, float] | None], viewer.Scene]:
     """Build a function that turns uploaded images into scenes with the tissue, mesh and model of a scenario."""
 
-    def opened(path: Path, spacing: tuple[float, float] | None) -> Scene:
+    def opened(path: Path, spacing: tuple[float, float] | None) -> viewer.Scene:
         values: dict[str, Any] = {"title": "Your image", "image.file": str(path), "image.spacing": spacing, "image.frame": 0,
                   "image.region": None, "tissue.region": [], "mesh.clamped_points": [], "exercise": []}  # fmt: skip
         bare = scenario.with_values(values, "upload")
+        io_room.open_recording(path, LARGEST_UPLOAD, whole=False)  # refuses a bomb by its header
         image = bare.read_image(path.parent)
         x0, x1, y0, _ = bare.grid(image).extent
         return scene_of(bare.with_values({"needle.entry": (x0 + 0.2 * (x1 - x0), y0)}), image, path.parent)

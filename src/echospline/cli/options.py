@@ -6,15 +6,24 @@ The help text, range and default of every option come from the scenario's own ta
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_type_hints
 
 import typer
+from typer.core import TyperCommand, TyperOption
 
+from echospline import scenario as scenario_room
 from echospline.errors import InputError
-from echospline.scenario import Scenario, describe, load
+
+LOOKS: dict[str, Any] = {
+    "add_completion": False,
+    "rich_markup_mode": "markdown",
+    "pretty_exceptions_enable": False,
+}
+"""Settings of every Typer application."""
 
 
 def _numbers(text: str) -> list[float]:
@@ -32,6 +41,10 @@ def integers(text: str) -> list[int]:
 
 def _words(text: str) -> list[str]:
     return [part.strip() for part in text.split(",") if part.strip()]
+
+
+def _edges(text: str) -> list[str]:
+    return [] if text.strip() == "none" else _words(text)
 
 
 def _border(text: str) -> float | str:
@@ -61,6 +74,7 @@ OPTIONS = (
     Option("--region", "image.region", "L,T,R,B", integers, "Image"),
     Option("--mesh", "mesh.nodes", "NXxNY", _nodes, "Mesh"),
     Option("--clamped", "mesh.clamped", "EDGE,...", _words, "Mesh"),
+    Option("--sliding", "mesh.sliding", "EDGE,...|none", _edges, "Mesh"),
     Option("--entry", "needle.entry", "X,Y", _numbers),
     Option("--angle", "needle.angle", "DEG"),
     Option("--depth", "needle.depth", "MM"),
@@ -79,19 +93,32 @@ OPTIONS = (
     _landmark("drag", "0..1"),
     _landmark("tip", "point|node"),
     _landmark("loading", "LAW"),
+    _landmark("friction_speed", "MM_S"),
     _landmark("contact_spacing", "MM"),
     _landmark("anchor_spacing", "MM"),
     Option("--elastic-radius", "model.elastic.radius", "MM", None, "Model tps, elastic"),
     Option("--green-radius", "model.green.radius", "MM", None, "Model fem, green"),
+    Option("--green-method", "model.green.method", "auto|boundary|regions|solve", None, "Model fem, green"),
     Option("--tip-force", "model.forces.tip", "N", None, "Model fem, green"),
+    Option("--law", "model.forces.law", "LAW", None, "Model fem, green"),
+    Option("--friction-limit", "model.forces.friction_limit", "N/MM", None, "Model fem, green"),
+    Option("--bond", "model.forces.bond", "N/MM2", None, "Model fem, green"),
+    Option("--tip-stiffness", "model.forces.tip_stiffness", "N/MM", None, "Model fem, green"),
+    Option("--side-stiffness", "model.forces.side_stiffness", "N/MM2", None, "Model fem, green"),
+    Option("--viscosity", "model.forces.viscosity", "NS/MM2", None, "Model fem, green"),
+    Option("--station-spacing", "model.forces.station_spacing", "MM", None, "Model fem, green"),
+    Option("--substep", "model.forces.substep", "MM", None, "Model fem, green"),
+    Option("--dead-band", "model.forces.dead_band", "MM", None, "Model fem, green"),
     Option("--shaft-friction", "model.forces.friction", "NS/MM2", None, "Model fem, green"),
     Option("--ramp", "model.forces.ramp", "MM", None, "Model fem, green"),
     Option("--young", "tissue.young", "KPA", None, "Model fem, green"),
     Option("--poisson", "tissue.poisson", "NU", None, "Model fem, green"),
+    Option("--material", "tissue.material", "linear|neo-hookean", None, "Model fem"),
     Option("--thickness", "tissue.thickness", "MM", None, "Model fem, green"),
     Option("--fps", "output.fps", "N", None, "Output"),
     Option("--formats", "output.formats", "NAME,...", _words, "Output"),
     Option("--border", "output.border", "VALUE", _border, "Output"),
+    Option("--window", "output.window", "LOW,HIGH", _numbers, "Output"),
     Option("--folding", "output.folding", "flag|refuse", None, "Output"),
     Option("--image-model", "output.image_model", "warp|rescatter", None, "Output"),
     Option("--needle/--no-needle", "output.needle", "", None, "Output"),
@@ -117,7 +144,6 @@ def with_scenario_options(command: Callable[..., None]) -> Callable[..., None]:
                 None,
                 option.flag,
                 metavar=option.metavar or None,
-                help=describe(option.key),
                 rich_help_panel=option.panel,
                 show_default=False,
             ),
@@ -130,13 +156,32 @@ def with_scenario_options(command: Callable[..., None]) -> Callable[..., None]:
         command(**given, changes=changes)
 
     named: Any = wrapped
+    named.command_class = ScenarioCommand
     named.__name__, named.__doc__ = command.__name__, command.__doc__
     named.__signature__ = inspect.Signature([*own, *extra])
     named.__annotations__ = {p.name: p.annotation for p in (*own, *extra)}
     return wrapped
 
 
-def scenario_from(source: str, changes: dict[str, Any]) -> tuple[Scenario, Path]:
+def say(doubts: Iterable[str]) -> None:
+    """Print doubts on stderr, one line each."""
+    for doubt in doubts:
+        print(f"echospline: doubt: {doubt}", file=sys.stderr)
+
+
+class ScenarioCommand(TyperCommand):
+    """A command with options of a scenario, whose help is read from the scenario's tables when it is shown."""
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Describe the keys, then write the help."""
+        keys = {_name(option): option.key for option in OPTIONS}
+        for parameter in self.params:
+            if isinstance(parameter, TyperOption) and parameter.help is None and parameter.name in keys:
+                parameter.help = scenario_room.describe(keys[parameter.name])
+        super().format_help(ctx, formatter)
+
+
+def scenario_from(source: str, changes: dict[str, Any]) -> tuple[scenario_room.Scenario, Path]:
     """Read a scenario, or start one on an image, and apply the options given.
 
     Returns
@@ -151,9 +196,9 @@ def scenario_from(source: str, changes: dict[str, Any]) -> tuple[Scenario, Path]
         If the file or an option is invalid.
     """
     if source.lower().endswith(".toml"):
-        scenario, folder = load(source), Path(source).resolve().parent
+        scenario, folder = scenario_room.load(source), Path(source).resolve().parent
     else:
-        scenario, folder = Scenario(), Path.cwd()
+        scenario, folder = scenario_room.Scenario(), Path.cwd()
         changes = {"image.file": source, **changes}
     try:
         return scenario.with_values({k: _read(k, v) for k, v in changes.items()}, "options"), folder
@@ -176,4 +221,6 @@ def _read(key: str, value: Any) -> Any:
     try:
         return option.read(value)
     except ValueError:
-        raise InputError(f"{option.flag} expects {option.metavar} ({describe(key)}); got {value!r}") from None
+        raise InputError(
+            f"{option.flag} expects {option.metavar} ({scenario_room.describe(key)}); got {value!r}"
+        ) from None

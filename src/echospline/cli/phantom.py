@@ -8,19 +8,16 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
-from rich.console import Console
-from rich.progress import track as counted
 
-from echospline.cli.options import scenario_from, with_scenario_options
+from echospline import io as io_room
+from echospline import laboratory
+from echospline import picture as picture_room
+from echospline import scenario as scenario_room
+from echospline import scene as scene_room
+from echospline.atomic import claimed
+from echospline.cli.options import say, scenario_from, with_scenario_options
 from echospline.errors import InputError
-from echospline.io import EchoWriter, open_writer
-from echospline.laboratory import Phantom, phantom_pictures, speckle_statistics
-from echospline.picture import frame_count
-from echospline.scenario import PHANTOM, Scenario, build_model
-from echospline.scenario.run import run
-from echospline.scene import Echo, UltrasoundImage
 
 
 @with_scenario_options
@@ -44,6 +41,8 @@ def phantom(
     tissue. Writes the cine, `displacement.npz` (the true motion), `echoes.npz` (for `track`), `summary.png`,
     `scenario.toml` and `run.json`. The tables [probe] and [phantom] describe probe and phantom.
     """
+    from rich.console import Console
+
     if not source.lower().endswith(".toml"):
         raise InputError(
             f"phantom takes a scenario (.toml) with tables [probe] and [phantom]; got {source!r}"
@@ -61,52 +60,71 @@ def phantom(
 
 
 def phantom_into(
-    scenario: Scenario, out: Path, folder: Path, *, echoes: bool, rf: bool = False, quiet: bool = True
+    scenario: scenario_room.Scenario,
+    out: Path,
+    folder: Path,
+    *,
+    echoes: bool,
+    rf: bool = False,
+    quiet: bool = True,
 ) -> dict[str, Any]:
     """Run a scenario on its phantom; returns the report of `run` with a table ``phantom``."""
+    import numpy as np
+    from rich.console import Console
+    from rich.progress import track as counted
+
     # the resolved scenario names its own picture, so that simulate and identify use the same mesh
-    scenario = scenario.with_values({"image.file": PHANTOM, "image.region": None, "image.spacing": None})
+    scenario = scenario.with_values(
+        {"image.file": scenario_room.PHANTOM, "image.region": None, "image.spacing": None}
+    )
     section, probe = scenario.phantom, scenario.probe.probe()
     scattered = section.phantom(probe)
     display = section.display()
     still = scattered.form(noise_seed=scattered.seed)
-    image = UltrasoundImage(still.b_mode(display, scattered.grid).pixels, scattered.grid, "speckle phantom")
-    model = build_model(scenario, scenario.grid(image), folder=folder)
-    count = frame_count(scenario.insertion(), scenario.output.fps)
+    image = scene_room.UltrasoundImage(
+        still.b_mode(display, scattered.grid).pixels, scattered.grid, "speckle phantom"
+    )
+    scenario, doubts = scenario_room.prepared(scenario, image, out)
+    say(doubts)
+    model = scenario_room.build_model(scenario, scenario.grid(image), folder=folder)
+    count = picture_room.frame_count(scenario.insertion(), scenario.output.fps)
     fps = scenario.output.fps
     with ExitStack() as stack:
+        stack.enter_context(claimed(out))
         writer = (
-            stack.enter_context(EchoWriter(out / "echoes.npz", count, scattered.samples, probe.carrier))
+            stack.enter_context(
+                io_room.EchoWriter(out / "echoes.npz", count, scattered.samples, probe.carrier)
+            )
             if echoes
             else None
         )
         lines = None
         if rf:
             grid = still.rf(probe.sampling, probe.sound_speed)[1]
-            lines = stack.enter_context(open_writer(out / "rf.mha", grid, fps))
+            lines = stack.enter_context(io_room.open_writer(out / "rf.mha", grid, fps))
         bar = iter(
             counted(range(count), "imaging", console=Console(stderr=True), disable=quiet, transient=True)
         )
 
-        def record(index: int, echo: Echo) -> None:
+        def record(index: int, echo: scene_room.Echo) -> None:
             next(bar, None)
             if writer is not None:
                 writer.add(echo, index / fps)
             if lines is not None:
                 lines.add(echo.rf(probe.sampling, probe.sound_speed)[0].astype(np.float32), index / fps)
 
-        former = phantom_pictures(
+        former = laboratory.phantom_pictures(
             scattered, display=display, fps=fps, out_of_plane=section.out_of_plane, record=record
         )
-        report = run(scenario, image, model, out, folder, form_image=former)
+        report = scenario_room.run(scenario, image, model, out, folder, form_image=former, doubts=doubts)
     report["phantom"] = described(scattered, still)
     report["files"] += [name for name, made in (("echoes.npz", echoes), ("rf.mha", rf)) if made]
     return report
 
 
-def described(phantom: Phantom, still: Echo) -> dict[str, Any]:
+def described(phantom: laboratory.Phantom, still: scene_room.Echo) -> dict[str, Any]:
     """Describe the phantom, and the statistics of its speckle at rest."""
-    found = speckle_statistics(still.envelope(), still.grid.spacing)
+    found = laboratory.speckle_statistics(still.envelope(), still.grid.spacing)
     return {
         "scatterers": len(phantom.scatterers.amplitudes),
         "carrier_per_mm": phantom.probe.carrier,

@@ -5,23 +5,19 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
-from threadpoolctl import threadpool_limits
 
-from echospline.atomic import part_of, writing
+from echospline import openigtlink
+from echospline import picture as picture_room
+from echospline import scenario as scenario_room
+from echospline import scene as scene_room
+from echospline.atomic import appearing, claimed
 from echospline.cli.link import axis_of
-from echospline.cli.options import scenario_from, with_scenario_options
+from echospline.cli.options import say, scenario_from, with_scenario_options
 from echospline.errors import InputError
-from echospline.io.sequence import SequenceWriter, read_sequence
-from echospline.openigtlink import read_calibration
-from echospline.picture import simulate
-from echospline.scenario import build_model
-from echospline.scene import Pixels
 
 
 @with_scenario_options
@@ -56,6 +52,12 @@ def recorded(
     options. Writes `resimulated.igs.mha` and `comparison.csv`: for each frame the correlation of the recorded picture with
     the simulated one, and with the first frame (the result without a simulation).
     """
+    import numpy as np
+    from threadpoolctl import threadpool_limits
+
+    # SimpleITK is slow to load
+    from echospline.io.sequence import SequenceWriter, read_sequence
+
     scenario, folder = scenario_from(str(file), changes or {})
     sequence = read_sequence(file)
     spacing = scenario.image.spacing
@@ -64,28 +66,32 @@ def recorded(
         needle_frame,
         spacing=spacing,
         axis=axis_of(needle_axis),
-        calibration=read_calibration(config) if config else None,
+        calibration=openigtlink.read_calibration(config) if config else None,
     )
-    model = build_model(scenario, scenario.grid(image), folder=folder)
+    say(scenario_room.size_doubts(image.grid) + scenario_room.needle_doubts(insertion, image.grid))
+    model = scenario_room.build_model(scenario, scenario.grid(image), folder=folder)
     span = float(insertion.times[-1] - insertion.times[0])
     fps = max(1.0, (len(insertion.times) - 1) / span)
     rows: list[dict[str, float]] = []
-    with threadpool_limits(limits=1), SequenceWriter(out / "resimulated.igs.mha", image.grid) as writer:
-        for frame in simulate(image, insertion, model, fps=fps, needle=scenario.needle_echo()):
-            time = float(insertion.times[0]) + frame.time
-            seen = cine.frames[int(np.argmin(np.abs(cine.times - time)))]
-            writer.add(frame.image.pixels, time, frame.pose)
-            rows.append(
-                {
-                    "time_s": time,
-                    "tip_x_mm": frame.pose.tip[0],
-                    "tip_y_mm": frame.pose.tip[1],
-                    "depth_mm": frame.pose.depth,
-                    "correlation_simulated": correlation(frame.image.pixels, seen),
-                    "correlation_still": correlation(image.pixels, seen),
-                }
-            )
-    _write(out / "comparison.csv", rows)
+    with claimed(out):
+        with threadpool_limits(limits=1), SequenceWriter(out / "resimulated.igs.mha", image.grid) as writer:
+            for frame in picture_room.simulate(
+                image, insertion, model, fps=fps, needle=scenario.needle_echo()
+            ):
+                time = float(insertion.times[0]) + frame.time
+                seen = cine.frames[int(np.argmin(np.abs(cine.times - time)))]
+                writer.add(frame.image.pixels, time, frame.pose)
+                rows.append(
+                    {
+                        "time_s": time,
+                        "tip_x_mm": frame.pose.tip[0],
+                        "tip_y_mm": frame.pose.tip[1],
+                        "depth_mm": frame.pose.depth,
+                        "correlation_simulated": correlation(frame.image.pixels, seen),
+                        "correlation_still": correlation(image.pixels, seen),
+                    }
+                )
+        _write(out / "comparison.csv", rows)
     told = {
         "recording": file.name,
         "frames": len(rows),
@@ -105,8 +111,10 @@ def recorded(
     )
 
 
-def correlation(first: Pixels, second: Pixels) -> float:
+def correlation(first: scene_room.Pixels, second: scene_room.Pixels) -> float:
     """Compute the normalised cross-correlation of two pictures, -1 to 1; 0 where one is uniform."""
+    import numpy as np
+
     a, b = first.astype(np.float64), second.astype(np.float64)
     a, b = a - a.mean(), b - b.mean()
     scale = float(np.sqrt((a * a).sum() * (b * b).sum()))
@@ -120,7 +128,5 @@ def _write(path: Path, rows: list[dict[str, float]]) -> None:
     table = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
     table.writeheader()
     table.writerows(rows)
-    part = part_of(path)
-    with writing(path):
+    with appearing(path) as part:
         part.write_text(text.getvalue(), encoding="ascii")
-        os.replace(part, path)

@@ -6,20 +6,18 @@ import json
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
-from rich.console import Console
-from rich.table import Table
 
+from echospline import live as live_room
+from echospline import scenario as scenario_room
+from echospline import viewer
+from echospline.atomic import appearing, claimed
 from echospline.cli.live import default_sessions
+from echospline.cli.options import LOOKS, say
 from echospline.errors import InputError
-from echospline.live import Trace
-from echospline.scenario import build_model, validated
-from echospline.scenario.run import run
-from echospline.viewer import Sessions, score, sessions_csv, trace_csv
 
 sessions = typer.Typer(
-    no_args_is_help=True, help="Training sessions: list, export, score again, make a cine."
+    **LOOKS, no_args_is_help=True, help="Training sessions: list, export, score again, make a cine."
 )
 
 Kept = Annotated[
@@ -35,6 +33,9 @@ def list_(
     json_: Annotated[bool, typer.Option("--json", help="print JSON")] = False,
 ) -> None:
     """List the sessions, newest first."""
+    from rich.console import Console
+    from rich.table import Table
+
     found = _open(kept).newest()
     if json_:
         print(json.dumps([session.to_dict() for session in found], indent=2))
@@ -71,20 +72,20 @@ def export(
 ) -> None:
     """Write the sessions, or the trace of one, as CSV."""
     stored = _open(kept)
-    text = sessions_csv(stored.newest(1_000_000)) if number is None else trace_csv(stored.load(number)[2])
-    part = out.with_name(out.name + ".part")
-    try:
+    text = (
+        viewer.sessions_csv(stored.newest(1_000_000))
+        if number is None
+        else viewer.trace_csv(stored.load(number)[2])
+    )
+    with appearing(out) as part:
         part.write_text(text, encoding="utf-8", newline="")
-        part.replace(out)
-    except OSError as error:
-        raise InputError(f"cannot write {out}: {error.strerror}") from error
 
 
 @sessions.command()
 def rescore(number: Number, kept: Kept = None) -> None:
     """Score a stored session again from its trace, and print both scores as JSON."""
     session, exercise, trace = _open(kept).load(number)
-    print(json.dumps({"stored": session.score, "now": score(trace, exercise).to_dict()}, indent=2))
+    print(json.dumps({"stored": session.score, "now": viewer.score(trace, exercise).to_dict()}, indent=2))
 
 
 @sessions.command()
@@ -94,22 +95,34 @@ def cine(
     kept: Kept = None,
 ) -> None:
     """Run a stored session's needle again: the cine with its true motion, as `echospline simulate` writes it."""
-    session, _, trace = _open(kept).load(number)
+    stored = _open(kept)
+    session, _, trace = stored.load(number)
     if not session.source:
         raise InputError(
             f"session {number} does not say what its scene was made from, so it cannot be run again"
         )
-    scenario = validated(json.loads(session.source), f"session {number}").with_values(
+    scenario = scenario_room.validated(json.loads(session.source), f"session {number}").with_values(
         {"needle.path": keyframes(trace), "model.kind": session.model}, f"session {number}"
     )
     folder = Path.cwd()
+    beside = stored.pictures.folder / Path(scenario.image.file).name
+    if (
+        session.upload and beside.is_file()
+    ):  # the sessions may have been moved, with their pictures beside them
+        scenario = scenario.with_values({"image.file": str(beside.resolve())}, f"session {number}")
     image = scenario.read_image(folder)
-    report = run(scenario, image, build_model(scenario, scenario.grid(image), folder=folder), out, folder)
+    scenario, doubts = scenario_room.prepared(scenario, image, out)
+    say(doubts)
+    model = scenario_room.build_model(scenario, scenario.grid(image), folder=folder)
+    with claimed(out):
+        report = scenario_room.run(scenario, image, model, out, folder, doubts=doubts)
     print(f"results in {out}: {', '.join(report['files'])}")
 
 
-def keyframes(trace: Trace) -> list[tuple[float, float, float, float, float]]:
+def keyframes(trace: live_room.Trace) -> list[tuple[float, float, float, float, float]]:
     """Return the rows of time, entry and tip for a scenario's path, at most 60 a second, first and last included."""
+    import numpy as np
+
     if len(trace) < 2:
         raise InputError("this session holds no motion")
     stride = max(1, int(1.0 / (KEYFRAMES_PER_SECOND * trace.period)))
@@ -119,8 +132,8 @@ def keyframes(trace: Trace) -> list[tuple[float, float, float, float, float]]:
     return [(float(t), float(ex), float(ey), float(tx), float(ty)) for t, ex, ey, tx, ty in columns]
 
 
-def _open(kept: Path | None) -> Sessions:
+def _open(kept: Path | None) -> viewer.Sessions:
     path = kept or default_sessions()
     if not path.exists():
         raise InputError(f"there are no sessions in {path}: finish an exercise in `echospline live` first")
-    return Sessions(path)
+    return viewer.Sessions(path)

@@ -6,19 +6,18 @@ import json
 import sys
 from importlib.resources import as_file, files
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
 
-from echospline.cli.options import scenario_from, with_scenario_options
-from echospline.laboratory import rescatter
-from echospline.picture import ImageFormer
-from echospline.scenario import Scenario, build_model
-from echospline.scenario.run import run
-from echospline.scene import UltrasoundImage
+from echospline import laboratory
+from echospline import scenario as scenario_room
+from echospline.atomic import claimed
+from echospline.cli.options import say, scenario_from, with_scenario_options
+
+if TYPE_CHECKING:
+    from echospline.picture import ImageFormer
+    from echospline.scene import UltrasoundImage
 
 Out = Annotated[Path, typer.Option("--out", help="folder for the results, made where it is not there")]
 Json = Annotated[bool, typer.Option("--json", help="print the report of the run as JSON, nothing else")]
@@ -56,19 +55,27 @@ def simulate_into(source: str, out: Path, changes: dict[str, Any], *, as_json: b
     """Run a scenario with a progress bar on a terminal, and print a summary."""
     scenario, folder = scenario_from(source, changes)
     image = scenario.read_image(folder)
-    model = build_model(scenario, scenario.grid(image), folder=folder)
+    scenario, doubts = scenario_room.prepared(scenario, image, out)
+    say(doubts)
+    model = scenario_room.build_model(scenario, scenario.grid(image), folder=folder)
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
     console = Console(stderr=True)
-    with Progress(
-        TextColumn("simulating"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=console,
-        transient=True,
-        disable=as_json or not console.is_terminal,
-    ) as bar:
+    with (
+        claimed(out),
+        Progress(
+            TextColumn("simulating"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+            console=console,
+            transient=True,
+            disable=as_json or not console.is_terminal,
+        ) as bar,
+    ):
         task = bar.add_task("simulating", total=None)
-        report = run(
+        report = scenario_room.run(
             scenario,
             image,
             model,
@@ -76,6 +83,7 @@ def simulate_into(source: str, out: Path, changes: dict[str, Any], *, as_json: b
             folder,
             progress=lambda done, count: bar.update(task, completed=done, total=count),
             form_image=_image_former(scenario, image),
+            doubts=doubts,
         )
     if as_json:
         json.dump(report, sys.stdout, indent=2)
@@ -84,17 +92,20 @@ def simulate_into(source: str, out: Path, changes: dict[str, Any], *, as_json: b
     _print_summary(report, out)
 
 
-def _image_former(scenario: Scenario, image: UltrasoundImage) -> ImageFormer | None:
+def _image_former(scenario: scenario_room.Scenario, image: UltrasoundImage) -> ImageFormer | None:
     """Return the image former, where it is not the warp."""
     if scenario.output.image_model == "warp":
         return None
     section = scenario.phantom
-    return rescatter(
+    return laboratory.rescatter(
         image, scenario.probe.probe(), display=section.display(), angles=section.angles, seed=section.seed
     )
 
 
 def _print_summary(report: dict[str, Any], out: Path) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
     console = Console()
     table = Table(title=f"{report['frames']} frames in {report['seconds']:.1f} s", title_justify="left")
     table.add_column("stage")
@@ -107,6 +118,11 @@ def _print_summary(report: dict[str, Any], out: Path) -> None:
         f"largest displacement {report['largest_displacement_mm']:.2f} mm, "
         f"inverse map within {report['inverse_map_residual_px']:.1e} px"
     )
+    if forces := report.get("largest_forces"):
+        console.print(
+            f"largest tip force {forces['tip_force_N']:.3f} N, friction {forces['friction_N']:.3f} N, "
+            f"side force {forces['side_force_N']:.3f} N"
+        )
     for fold in report["folded_frames"][:1]:
         console.print(
             f"[yellow]{len(report['folded_frames'])} frames fold, first at {fold['time_s']} s: {fold['what']}[/]"

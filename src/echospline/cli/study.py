@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
-from echospline.study import FULL, QUICK
-from echospline.study import study as run_study
+from echospline import study as study_room
+from echospline.atomic import claimed
+from echospline.cli.exvivo import exvivo
+from echospline.cli.options import LOOKS
 
 
 def study(
@@ -21,7 +21,7 @@ def study(
         "out/study"
     ),
     quick: Annotated[
-        bool, typer.Option("--quick", help="about a minute: fewer depths, meshes and runs")
+        bool, typer.Option("--quick", help="one to three minutes: fewer depths, meshes and runs")
     ] = False,
     seed: Annotated[int, typer.Option("--seed", min=0, help="of the searches")] = 0,
     workers: Annotated[
@@ -36,16 +36,21 @@ def study(
     """Regenerate the paper's study: Fig. 2, 3a, 3b, tables (CSV, JSON) and one self-contained report.html.
 
     Every model is compared with finite elements under the same needle, in accuracy (fitted and held-out insertions, four
-    moduli in both readings) and in time per step (every method named). Cases that are in the folder already are not run again.
+    moduli in both readings) and in time per step (every method named). Lesions, layers and other edges follow, and where linear and plane
+    elasticity stop being good. Cases that are in the folder already are not run again.
     """
+    from rich.console import Console
+    from rich.table import Table
+
     if context.invoked_subcommand is not None:
         return
     progress = Console(stderr=True)
     command = f"echospline study{' --quick' if quick else ''} --seed {seed}"
-    result = run_study(
-        out, QUICK if quick else FULL, seed=seed, workers=workers, scheduler=scheduler, image=image, command=command,
-        report=None if json_ else lambda what: progress.print(what, highlight=False),
-    )  # fmt: skip
+    with claimed(out):
+        result = study_room.study(
+            out, study_room.QUICK if quick else study_room.FULL, seed=seed, workers=workers, scheduler=scheduler, image=image, command=command,
+            report=None if json_ else lambda what: progress.print(what, highlight=False),
+        )  # fmt: skip
     if json_:
         json.dump(result, sys.stdout, indent=1)
         print()
@@ -58,3 +63,8 @@ def study(
         table.add_row(claim["claim"], claim["verdict"])
     console.print(table)
     console.print(f"report: {out / 'report.html'}")
+
+
+studies = typer.Typer(**LOOKS)
+studies.callback(invoke_without_command=True)(study)
+studies.command()(exvivo)

@@ -11,25 +11,13 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import typer
-from rich.console import Console
-from rich.progress import track as counted
 
+from echospline import scenario as scenario_room
+from echospline import tracking
+from echospline.cli.options import say
 from echospline.errors import InputError
 from echospline.io import head, read, read_echoes, read_needle
 from echospline.scene import Cine, Echo, EchoCine, Floats, NeedlePose, RegularGrid
-from echospline.tracking import (
-    BlockMatching,
-    FlowTracker,
-    Reference,
-    Track,
-    Tracker,
-    grey_pair,
-    grid_over,
-    inside_ahead,
-    region_ahead,
-    write_track,
-)
-from echospline.tracking import track as follow
 
 
 def track(
@@ -87,9 +75,16 @@ def track(
     and frame (0 to 1); `identify` reads it. Points that lost their speckle take their neighbours' motion, and their
     confidence says so.
     """
+    from rich.console import Console
+    from rich.progress import track as counted
+
     began = perf_counter()
     frames = load(cine, spacing=spacing, fps=fps, crop=crop, rf=rf, sound_speed=sound_speed)
+    say(scenario_room.size_doubts(frames.grid, "--spacing"))
+    scenario_room.check_points(frames.grid, grid, len(frames), "--grid")
     path = None if needle is None else read_needle(needle)
+    if path is not None:
+        say(scenario_room.needle_doubts(path, frames.grid))
     poses = None if path is None else [path.pose(t) for t in frames.times]
     if ahead is not None and poses is None:
         raise InputError("--ahead needs --needle: the region travels before its tip")
@@ -97,7 +92,7 @@ def track(
         raise InputError("--ahead tracks scattered points, which .mha cannot hold: write .npz")
     box = None if roi is None else numbers(roi, 4, "--roi")
     points = (
-        grid_over(frames.grid.extent, grid, box).nodes
+        tracking.grid_over(frames.grid.extent, grid, box).nodes
         if ahead is None
         else swept(poses or [], ahead, frames.grid)
     )
@@ -106,7 +101,7 @@ def track(
         if json_
         else lambda it: counted(list(it), "tracking", console=Console(stderr=True), transient=True)
     )
-    found = follow(
+    found = tracking.track(
         frames,
         points,
         tracker(method),
@@ -118,9 +113,11 @@ def track(
     )
     if ahead is not None and poses is not None:
         # a point outside the region of its frame is not needed
-        here = np.stack([inside_ahead(points, pose, ahead) for pose in poses])
-        found = Track(found.points, found.times, found.displacement, found.confidence * here, found.keyframes)
-    write_track(out, found, poses)
+        here = np.stack([tracking.inside_ahead(points, pose, ahead) for pose in poses])
+        found = tracking.Track(
+            found.points, found.times, found.displacement, found.confidence * here, found.keyframes
+        )
+    tracking.write_track(out, found, poses)
     report = summary(found, perf_counter() - began)
     picture = preview or out.with_suffix(".png")
     draw(frames, found, poses, picture)
@@ -162,15 +159,15 @@ def load(
     return EchoCine(iq / max(level, 1e-30), found.times, found.grid, carrier)
 
 
-def tracker(method: str) -> Tracker:
+def tracker(method: str) -> tracking.Tracker:
     """Return the method of that name."""
-    known: dict[str, Tracker] = {"flow": FlowTracker(), "block": BlockMatching()}
+    known: dict[str, tracking.Tracker] = {"flow": tracking.FlowTracker(), "block": tracking.BlockMatching()}
     if method not in known:
         raise InputError(f"--method is flow or block; got {method!r}")
     return known[method]
 
 
-def named_reference(reference: str) -> Reference:
+def named_reference(reference: str) -> tracking.Reference:
     """Check the name of a reference."""
     names: dict[str, Literal["keyframe", "first", "previous"]] = {
         "keyframe": "keyframe",
@@ -195,7 +192,7 @@ def numbers(text: str, count: int, option: str) -> list[float]:
 
 def swept(poses: Iterable[NeedlePose], distance: float, grid: RegularGrid) -> Floats:
     """Return the points of the region ahead of the tip over all frames, on one lattice of 0.2 mm, inside the picture."""
-    found = [region_ahead(pose, distance) for pose in poses if pose.depth > 0]
+    found = [tracking.region_ahead(pose, distance) for pose in poses if pose.depth > 0]
     points = np.concatenate(found) if found else np.empty((0, 2))
     lattice = np.unique(np.rint(points / 0.2).astype(int), axis=0) * 0.2
     lattice = lattice[grid.contains(lattice)]
@@ -204,7 +201,7 @@ def swept(poses: Iterable[NeedlePose], distance: float, grid: RegularGrid) -> Fl
     return np.asarray(lattice, dtype=np.float64)
 
 
-def summary(found: Track, seconds: float) -> dict[str, Any]:
+def summary(found: tracking.Track, seconds: float) -> dict[str, Any]:
     """Print a summary of the motion."""
     trusted = found.confidence >= 0.3
     size = np.hypot(found.displacement[..., 0], found.displacement[..., 1])
@@ -219,12 +216,12 @@ def summary(found: Track, seconds: float) -> dict[str, Any]:
     }
 
 
-def draw(frames: Cine | EchoCine, found: Track, poses: list[NeedlePose] | None, path: Path) -> None:
+def draw(frames: Cine | EchoCine, found: tracking.Track, poses: list[NeedlePose] | None, path: Path) -> None:
     """Draw the arrows of the frame that moved most over the first picture."""
     # matplotlib is slow to load
-    from echospline.picture.summary import tracking_figure  # noqa: PLC0415
+    from echospline.picture.summary import tracking_figure
 
-    grey, _, grid = grey_pair(frames[0], frames[0])
+    grey, _, grid = tracking.grey_pair(frames[0], frames[0])
     size = np.hypot(found.displacement[..., 0], found.displacement[..., 1]) * (found.confidence >= 0.3)
     k = int(size.max(axis=1).argmax())
     tracking_figure(

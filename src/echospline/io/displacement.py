@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import zipfile
-from dataclasses import dataclass
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
 from io import BytesIO
 from math import isfinite, prod
 from pathlib import Path
@@ -14,13 +16,15 @@ from typing import IO, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from echospline.atomic import give_name, part_of, writing
+from echospline.atomic import give_name, part_of, second_part, writing
 from echospline.errors import InputError
 from echospline.io.kind import head
 from echospline.io.recording import LIMIT, MIB, decoding
 from echospline.scene import Floats, NeedlePose, RegularGrid, as_points
 
 KEYS = ("points", "displacement", "times", "tip", "entry", "speed")
+LOADS = ("tip_force_N", "friction_N", "side_force_N", "torque_N_mm", "cut_mm")
+"""The needle's forces, recorded where the model knows them; files without them are whole."""
 _HEADER = 128
 """Bytes of a .npy header, fixed so that the number of frames can be filled in at the end."""
 _BLOCK = 2**20
@@ -42,6 +46,8 @@ class DisplacementRecord:
         n_t and n_s, mm.
     speed : ndarray, shape (frames,)
         Signed axial speed, mm/s.
+    loads : mapping of ndarray, shape (frames,)
+        The needle's forces by the names of `LOADS`; empty where none were recorded.
 
     Raises
     ------
@@ -55,6 +61,7 @@ class DisplacementRecord:
     tip: Floats
     entry: Floats
     speed: Floats
+    loads: Mapping[str, Floats] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         n, frames = len(self.points), len(self.times)
@@ -62,8 +69,9 @@ class DisplacementRecord:
             "points": (n, 2), "displacement": (frames, n, 2), "times": (frames,),
             "tip": (frames, 2), "entry": (frames, 2), "speed": (frames,),
         }  # fmt: skip
+        shapes |= dict.fromkeys(self.loads, (frames,))
         for name, shape in shapes.items():
-            array = getattr(self, name)
+            array = self.loads[name] if name in self.loads else getattr(self, name)
             if array.shape != shape:
                 raise InputError(f"{name} must have shape {shape}; got {array.shape}")
             if not np.isfinite(array).all():
@@ -101,7 +109,7 @@ class DisplacementRecord:
 class DisplacementWriter:
     """Writes ``displacement.npz`` frame by frame: fields go to the disk at once, only times and poses are kept.
 
-    Memory grows by a few hundred bytes a frame. Until `close`, the fields are in ``NAME.part``, a plain ``.npy`` array whose header
+    Memory grows by a few hundred bytes a frame. Until `close`, the fields are in ``NAME.xxxxxxxx.part``, a plain ``.npy`` array whose header
     is updated after every frame, so that a killed run leaves its fields readable (``numpy.load``).
 
     Parameters
@@ -123,13 +131,17 @@ class DisplacementWriter:
             raise InputError(f"a displacement record is written as .npz; got {self.path.name!r}")
         self._points = as_points(points).copy()
         self._rows: list[tuple[float, float, float, float, float, float]] = []
+        self._loads: list[tuple[float, ...]] = []
         self._closed = False
         with writing(self.path):
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = part_of(self.path).open("wb")
+            self._part = part_of(self.path)
+            self._file = self._part.open("xb")
             self._file.write(self._header())
 
-    def add(self, displacement: ArrayLike, time: float, pose: NeedlePose) -> None:
+    def add(
+        self, displacement: ArrayLike, time: float, pose: NeedlePose, load: Mapping[str, float] | None = None
+    ) -> None:
         """Write one frame.
 
         Parameters
@@ -140,6 +152,8 @@ class DisplacementWriter:
             s; later than the frame before.
         pose : NeedlePose
             The needle at that time.
+        load : mapping, optional
+            The needle's forces by the names of `LOADS`; for every frame or for none.
 
         Raises
         ------
@@ -155,7 +169,13 @@ class DisplacementWriter:
             raise InputError(f"displacement at {time} s holds a number that is not finite")
         if not isfinite(time) or (self._rows and time <= self._rows[-1][0]):
             raise InputError(f"times must ascend strictly; got {time} s after {self._rows[-1:]}")
+        numbers = tuple(float(load[name]) for name in LOADS) if load else ()
+        if self._loads and len(numbers) != len(self._loads[0]):
+            raise InputError("the needle's forces are recorded for every frame or for none")
+        if not all(map(isfinite, numbers)):
+            raise InputError(f"a force of the needle at {time} s is not finite")
         with writing(self.path):
+            self._loads.append(numbers)
             self._file.seek(0, os.SEEK_END)
             self._file.write(field.data)
             self._rows.append((float(time), *pose.tip, *pose.entry, pose.speed))
@@ -170,15 +190,18 @@ class DisplacementWriter:
         rows = np.array(self._rows, dtype=np.float64).reshape(-1, 6)
         small = {"points": self._points, "times": rows[:, 0], "tip": rows[:, 1:3], "entry": rows[:, 3:5],
                  "speed": rows[:, 5]}  # fmt: skip
+        loads = np.array(self._loads, dtype=np.float64).reshape(len(rows), -1)
+        small |= dict(zip(LOADS, loads.T, strict=False))
         with writing(self.path):
             self._file.close()
-            part = part_of(self.path)
-            whole = part.with_name(part.name + "2")
-            with zipfile.ZipFile(whole, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
-                for name in KEYS:
+            with (
+                second_part(self._part) as whole,
+                zipfile.ZipFile(whole, "w", zipfile.ZIP_STORED, allowZip64=True) as archive,
+            ):
+                for name in ("displacement", *small):
                     with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                         if name == "displacement":
-                            with part.open("rb") as fields:
+                            with self._part.open("rb") as fields:
                                 while block := fields.read(_BLOCK):
                                     member.write(block)
                         else:
@@ -186,7 +209,7 @@ class DisplacementWriter:
                             np.save(buffer, np.ascontiguousarray(small[name]), allow_pickle=False)
                             member.write(buffer.getvalue())
             give_name(whole, self.path)
-            part.unlink(missing_ok=True)
+            self._part.unlink(missing_ok=True)
 
     def __enter__(self) -> Self:
         return self
@@ -198,7 +221,8 @@ class DisplacementWriter:
             self.close()
         elif not self._closed:
             self._closed = True
-            self._file.close()
+            with suppress(OSError):  # the error on its way says what is wrong
+                self._file.close()
 
     def _header(self) -> bytes:
         """Return a .npy header (format 1.0) of fixed length for the frames so far."""
@@ -231,8 +255,9 @@ def read_displacement(path: str | Path, *, limit: float = LIMIT) -> Displacement
             f"{path} declares arrays of {size:,.0f} MiB, more than the limit of {limit:,.0f} MiB: raise it"
         )
     with decoding(path, "displacement.npz"), zipfile.ZipFile(path) as archive:
-        arrays = {name: _array(archive, path, name) for name in KEYS}
-    return DisplacementRecord(**arrays)
+        arrays = {name: _array(archive, path, name) for name in shapes}
+    loads = {name: arrays.pop(name) for name in LOADS if name in arrays}
+    return DisplacementRecord(**arrays, loads=loads)
 
 
 def displacement_shapes(path: str | Path) -> dict[str, tuple[int, ...]]:
@@ -247,7 +272,10 @@ def displacement_shapes(path: str | Path) -> dict[str, tuple[int, ...]]:
     if not head(path).startswith(b"PK"):
         raise InputError(f"{path} is no zip archive; expected a displacement.npz")
     with decoding(path, "displacement.npz"), zipfile.ZipFile(path) as archive:
-        return {name: _declared(archive, path, name)[0] for name in KEYS}
+        names = {member.removesuffix(".npy") for member in archive.namelist()}
+        return {
+            name: _declared(archive, path, name)[0] for name in (*KEYS, *(n for n in LOADS if n in names))
+        }
 
 
 def _declared(

@@ -21,7 +21,7 @@ KEYS = ("iq", "times", "spacing", "origin", "carrier")
 class EchoWriter:
     """Writes a known number of frames to ``echoes.npz``; holds one at a time.
 
-    The file is called ``NAME.part`` until it is whole.
+    The file has a temporary name until it is whole.
 
     Parameters
     ----------
@@ -43,7 +43,8 @@ class EchoWriter:
         self._times: list[float] = []
         with writing(self.path):
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._zip = zipfile.ZipFile(part_of(self.path), "w", zipfile.ZIP_STORED, allowZip64=True)
+            self._part = part_of(self.path)
+            self._zip = zipfile.ZipFile(self._part, "x", zipfile.ZIP_STORED, allowZip64=True)
             self._member: IO[bytes] = self._zip.open("iq.npy", "w", force_zip64=True)
             np.lib.format.write_array_header_1_0(
                 self._member, {"descr": "<c8", "fortran_order": False, "shape": (frames, *grid.shape[::-1])}
@@ -76,7 +77,7 @@ class EchoWriter:
             if kind is None:
                 if len(self._times) != self._frames:
                     raise InputError(f"{self.path.name} got {len(self._times)} of {self._frames} frames")
-                give_name(part_of(self.path), self.path)
+                give_name(self._part, self.path)
 
 
 def read_echoes(path: str | Path, *, limit: float = LIMIT) -> EchoCine:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -24,9 +23,11 @@ class FramesEncoder:
     Parameters
     ----------
     part : Path
-        Temporary folder; one left by an earlier run is emptied.
+        Temporary folder, which is not there yet.
     grid : RegularGrid
         Pixel centres, mm; the spacing goes into each file's comment.
+    final : Path
+        The folder that it will replace.
 
     Raises
     ------
@@ -34,12 +35,8 @@ class FramesEncoder:
         If the folder to be replaced holds anything but frames.
     """
 
-    def __init__(self, part: Path, grid: RegularGrid) -> None:
-        final = part.with_name(part.name.removesuffix(".part"))
-        for folder in (part, final):
-            check_ours(folder)
-        if part.exists():
-            shutil.rmtree(part)
+    def __init__(self, part: Path, grid: RegularGrid, final: Path) -> None:
+        check_ours(final)
         part.mkdir()
         self._part = part
         self._note = PngInfo()

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from echospline.atomic import second_part
 from echospline.errors import InputError
 from echospline.scene import Pixels, RegularGrid
 
@@ -63,8 +64,7 @@ class MetaImageEncoder:
     def finish(self) -> Path:
         """Write header, time stamps and pixels into a whole file."""
         self._file.close()
-        whole = self._part.with_name(self._part.name + "2")
-        with self._part.open("rb") as source, whole.open("wb") as target:
+        with second_part(self._part) as whole, self._part.open("rb") as source, whole.open("wb") as target:
             target.write(self._header(stamps=True))
             source.seek(len(self._header(stamps=False)))
             shutil.copyfileobj(source, target, 2**20)

@@ -10,6 +10,7 @@ import av
 import numpy as np
 from av.video.reformatter import ColorRange, Colorspace
 
+from echospline.atomic import second_part
 from echospline.errors import InputError
 from echospline.io.tag import spacing_tag
 from echospline.scene import Pixels, RegularGrid
@@ -83,8 +84,8 @@ class Mp4Encoder:
         """Flush the encoder and lay the packets out as a plain MP4."""
         self._container.mux(self._stream.encode(None))
         self._container.close()
-        whole = self._part.with_name(self._part.name + "2")
         with (
+            second_part(self._part) as whole,
             av.open(str(self._part), format="mp4") as source,
             av.open(str(whole), "w", format="mp4", options={"movflags": "faststart"}) as target,
         ):

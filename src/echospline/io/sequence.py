@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -11,7 +12,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from echospline.atomic import give_name, part_of, writing
+from echospline.atomic import appearing, part_of, writing
 from echospline.errors import InputError
 from echospline.io.sequence_header import Header, read_header, read_pixels, write_header
 from echospline.scene import (
@@ -246,10 +247,9 @@ class SequenceWriter:
         self._tips: list[Floats] = []
         self._entries: list[Floats] = []
         self._form: tuple[tuple[int, ...], np.dtype[np.generic]] | None = None
-        self._part = part_of(self.path)
         with writing(self.path):
-            self._part.parent.mkdir(parents=True, exist_ok=True)
-            self._spool = self._part.with_name(self._part.name + ".pixels").open("w+b")
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._spool = part_of(self.path).open("x+b")
 
     def add(self, pixels: Pixels, time: float, pose: NeedlePose) -> None:
         """Append one frame.
@@ -306,22 +306,20 @@ class SequenceWriter:
             valid=np.ones(count, dtype=bool),
             spacing=self.grid.spacing,
         )
-        with writing(self.path), self._part.open("wb") as file:
-            file.write(write_header(header, self.path, image))
-            self._spool.seek(0)
-            while block := self._spool.read(1 << 20):
-                file.write(block)
-        give_name(self._part, self.path)
-        self._drop_spool()
+        try:
+            with appearing(self.path) as part, part.open("xb") as file:
+                file.write(write_header(header, self.path, image))
+                self._spool.seek(0)
+                while block := self._spool.read(1 << 20):
+                    file.write(block)
+        finally:
+            self.abandon()
         return self.path
 
     def abandon(self) -> None:
-        """Remove the temporary files."""
-        self._drop_spool()
-        self._part.unlink(missing_ok=True)
-
-    def _drop_spool(self) -> None:
-        self._spool.close()
+        """Remove the temporary file."""
+        with suppress(OSError):  # what a full disk did not take is of no use
+            self._spool.close()
         Path(self._spool.name).unlink(missing_ok=True)
 
     def __enter__(self) -> Self:

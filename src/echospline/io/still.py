@@ -8,9 +8,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageSequence
+from PIL import Image
 
 from echospline.errors import InputError
+from echospline.io.animation import gif_delays, png_delays
 from echospline.io.recording import Recording, check_size, decoding, quietly
 from echospline.io.tag import tagged_spacing
 from echospline.scene import Pixels
@@ -46,12 +47,13 @@ def open_picture(path: Path, format: str, limit: float) -> Recording:
             raise InputError(
                 f"{path} has pixels of Pillow's mode {mode!r}; expected grey or RGB: convert it to RGB"
             )
-        frames = int(getattr(image, "n_frames", 1))
+        delays = _delays(path, format)
+        # Pillow counts the frames of a GIF by reading through all of them.
+        frames = max(1, len(delays)) if format == "GIF" else int(getattr(image, "n_frames", 1))
         grey = mode in _GREY or (mode == "P" and frames == 1 and _grey_palette(image))
         channels = 1 if grey or mode in _DEEP else 3
         dtype = np.dtype(_DEEP.get(mode, np.uint8))
         check_size(path, image.height, image.width, frames, channels * dtype.itemsize, limit)
-        delays = [_delay(page) for page in ImageSequence.Iterator(image)] if format in ("GIF", "PNG") else []
         rows, columns = image.height, image.width
         spacing = tagged_spacing(image.info.get("Comment")) if format == "PNG" else None
 
@@ -67,7 +69,7 @@ def open_picture(path: Path, format: str, limit: float) -> Recording:
 
     notes = []
     times = None
-    if frames > 1 and delays and any(d is not None for d in delays):
+    if frames > 1 and len(delays) == frames and any(d is not None for d in delays):
         times = np.concatenate([[0.0], np.cumsum([(d or _STILL_DELAY) for d in delays[:-1]])]) / 1000.0
         if not all(delays):
             notes.append(f"some frames declare no duration: {_STILL_DELAY} ms taken, as browsers do")
@@ -113,9 +115,11 @@ def _pixels(
     return np.ascontiguousarray(pixels)
 
 
-def _delay(page: Image.Image) -> float | None:
-    value = page.info.get("duration")
-    return float(value) if value is not None else None
+def _delays(path: Path, format: str) -> list[float | None]:
+    """Return the times for which frames are shown, ms, from the headers: no frame is decoded for them."""
+    if format == "GIF":
+        return gif_delays(path)
+    return png_delays(path) if format == "PNG" else []
 
 
 def _grey_palette(image: Image.Image) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from math import isfinite
 from pathlib import Path
 from types import TracebackType
@@ -12,7 +13,7 @@ import numpy as np
 
 from echospline.atomic import give_name, part_of, writing
 from echospline.errors import InputError
-from echospline.scene import Pixels, RegularGrid
+from echospline.scene import Pixels, RegularGrid, is_number
 
 FORMATS = (".mp4", ".gif", ".mha")
 
@@ -33,9 +34,9 @@ class Encoder(Protocol):
 class CineWriter:
     """Writes frames one by one to one file or folder and keeps none in memory.
 
-    Until `close`, the file is called ``NAME.part``; `close` completes it and renames it in one
-    step. If the ``with`` block ends with an exception, or the process dies, ``NAME.part`` remains with
-    the frames so far, readable, and an earlier file NAME is unchanged.
+    Until `close`, the file is called ``NAME.xxxxxxxx.part``, which no other writer uses; `close` completes it and renames it in
+    one step. If the ``with`` block ends with an exception, or the process dies, it remains under that name with the frames so
+    far, readable, and an earlier file NAME is unchanged.
 
     Parameters
     ----------
@@ -63,6 +64,7 @@ class CineWriter:
         self.grid = grid
         self.count = 0
         self._open, self._types, self._window = encoder, types, window
+        self._part = part_of(path)
         self._encoder: Encoder | None = None
         self._last = -np.inf
         self._form: tuple[tuple[int, ...], np.dtype[np.generic]] | None = None
@@ -104,10 +106,9 @@ class CineWriter:
         pixels = self._fitting(pixels)
         if self._encoder is None:
             self._form = form
-            part = part_of(self.path)
             with writing(self.path):
-                part.parent.mkdir(parents=True, exist_ok=True)
-                self._encoder = self._open(part, self.grid, pixels.ndim == 3, pixels.dtype)
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+                self._encoder = self._open(self._part, self.grid, pixels.ndim == 3, pixels.dtype)
         with writing(self.path):
             self._encoder.add(pixels, float(time))
         self._last = float(time)
@@ -128,7 +129,7 @@ class CineWriter:
             raise InputError(f"no frame was added to {self.path}: a cine needs one or more")
         with writing(self.path):
             give_name(self._encoder.finish(), self.path)
-            part_of(self.path).unlink(missing_ok=True)
+            self._part.unlink(missing_ok=True)
 
     def __enter__(self) -> Self:
         return self
@@ -141,7 +142,9 @@ class CineWriter:
         elif not self._closed:
             self._closed = True
             if self._encoder is not None:
-                self._encoder.abandon()
+                # the error on its way says what is wrong: a full disk takes no trailer either
+                with suppress(OSError, ValueError, RuntimeError):
+                    self._encoder.abandon()
 
     def _fitting(self, pixels: Pixels) -> Pixels:
         if not self._types or (pixels.dtype in self._types and self._window is None):
@@ -183,7 +186,7 @@ def open_writer(
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if not (isfinite(fps) and fps > 0):
+    if not (is_number(fps) and fps > 0):
         raise InputError(f"fps must be a positive number of frames per second; got {fps}")
     if window is not None and not (len(window) == 2 and np.isfinite(window).all() and window[0] < window[1]):
         raise InputError(f"window must be two pixel values, low before high; got {window}")
@@ -205,7 +208,7 @@ def open_writer(
         from echospline.io.frames import FramesEncoder  # noqa: PLC0415
 
         return CineWriter(
-            path, grid, lambda p, g, c, t: FramesEncoder(p, g), (byte, np.dtype(np.uint16)), window
+            path, grid, lambda p, g, c, t: FramesEncoder(p, g, path), (byte, np.dtype(np.uint16)), window
         )
     raise InputError(
         f"a cine is written as {', '.join(FORMATS)} or to a folder of PNG files (no suffix); got {path.name!r}"

@@ -1,11 +1,18 @@
 """The live loop: one tissue model stepped at a fixed rate; newest command in, newest snapshot out, no queue."""
 
-from echospline.live.engine import LiveEngine, ModelFactory
-from echospline.live.motion import follow
-from echospline.live.pacer import Metronome, Pacer
-from echospline.live.recorder import Recorder, Trace
-from echospline.live.slot import Numbered, Slot
-from echospline.live.snapshot import Command, Snapshot
+from typing import TYPE_CHECKING
+
+from echospline.menu import on_demand
+
+if TYPE_CHECKING:  # the menu, loaded on demand
+    from echospline.live.engine import LiveEngine, ModelFactory
+    from echospline.live.motion import follow
+    from echospline.live.pacer import Metronome, Pacer
+    from echospline.live.recorder import Recorder, Trace
+    from echospline.live.slot import Numbered, Slot
+    from echospline.live.snapshot import Command, Snapshot
+else:
+    on_demand(__name__)
 
 __all__ = [
     "Command",

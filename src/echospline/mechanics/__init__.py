@@ -1,30 +1,45 @@
 """Tissue models: one protocol, and thin plate spline, Green's function and finite elements behind it."""
 
-from echospline.mechanics.anchored_kernel import AnchoredKernel
-from echospline.mechanics.fem import FEMModel
-from echospline.mechanics.forces import NeedleForces
-from echospline.mechanics.green import GreenModel
-from echospline.mechanics.kernels import Elastic, Kernel, ThinPlate
-from echospline.mechanics.landmark_stiffness import landmark_stiffness
-from echospline.mechanics.landmarks import Clamps
-from echospline.mechanics.native import describe_core
-from echospline.mechanics.parameters import TPSParameters
-from echospline.mechanics.protocol import TissueModel
-from echospline.mechanics.tps import Solver, TPSModel
+from typing import TYPE_CHECKING
+
+from echospline.menu import on_demand
+
+if TYPE_CHECKING:  # the menu, loaded on demand
+    from echospline.mechanics.anchored_kernel import AnchoredKernel
+    from echospline.mechanics.fem import FEMModel
+    from echospline.mechanics.force_model import ForceModel
+    from echospline.mechanics.forces import Forces, NeedleForces, NeedleLoad, ViscousForces
+    from echospline.mechanics.green import GreenModel
+    from echospline.mechanics.kernels import Elastic, Kernel, ThinPlate
+    from echospline.mechanics.landmark_stiffness import landmark_stiffness
+    from echospline.mechanics.landmarks import Clamps
+    from echospline.mechanics.native import describe_core
+    from echospline.mechanics.neo_hookean_model import NeoHookeanModel
+    from echospline.mechanics.parameters import TPSParameters
+    from echospline.mechanics.protocol import TissueModel
+    from echospline.mechanics.tps import Solver, TPSModel, anchors_for
+else:
+    on_demand(__name__)
 
 __all__ = [
     "AnchoredKernel",
     "Clamps",
     "Elastic",
     "FEMModel",
+    "ForceModel",
+    "Forces",
     "GreenModel",
     "Kernel",
     "NeedleForces",
+    "NeedleLoad",
+    "NeoHookeanModel",
     "Solver",
     "TPSModel",
     "TPSParameters",
     "ThinPlate",
     "TissueModel",
+    "ViscousForces",
+    "anchors_for",
     "describe_core",
     "landmark_stiffness",
 ]

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import lu_factor, lu_solve
 
 from echospline.errors import InputError
@@ -35,12 +35,14 @@ class AnchoredKernel:
         In conditioned coordinates (x - centre) / scale.
     anchors, points : ndarray, shape (b, 2) and (n, 2)
         Conditioned.
-    table : ndarray, shape (b c + p, n c)
+    table : ndarray, shape (k, n c)
         [U_xB P_x]', what every row needs of the points.
     factors
         LU of L_B.
     centre, scale
         mm.
+    kept : ndarray of bool, shape (b c + p,)
+        Which components of which anchors are held (all x, then all y), and all motions; k of them.
     """
 
     kernel: Kernel
@@ -50,6 +52,7 @@ class AnchoredKernel:
     factors: Any
     centre: Floats
     scale: float
+    kept: NDArray[np.bool_]
 
     @classmethod
     def factor(
@@ -58,6 +61,7 @@ class AnchoredKernel:
         anchors: ArrayLike,
         points: Floats,
         stiffness: ArrayLike | None = None,
+        held: NDArray[np.bool_] | None = None,
     ) -> AnchoredKernel:
         """Assemble and factor L_B.
 
@@ -71,6 +75,8 @@ class AnchoredKernel:
             Where rows are evaluated (the mesh nodes), mm.
         stiffness : array_like, shape (b,), optional
             As in `spline.factor`; infinite holds exactly.
+        held : ndarray of bool, shape (b, 2), optional
+            Which components each anchor holds; all when not given.
 
         Raises
         ------
@@ -78,13 +84,18 @@ class AnchoredKernel:
             If the anchors alone do not hold the tissue (they lie on one line).
         """
         fixed = as_points(anchors, "anchors")
+        partly = held is not None and not held.all()
+        kernel = kernel.apart() if partly else kernel
         c = kernel.components
         centre = 0.5 * (fixed.min(axis=0) + fixed.max(axis=0))
         scale = float(np.ptp(fixed, axis=0).max()) / 2 or 1.0
         B, x = (fixed - centre) / scale, (points - centre) / scale
         conditioned = kernel.scaled(scale)
         R = conditioned.polynomial(B)
-        singular = np.linalg.svd(R, compute_uv=False)
+        kept = np.ones(len(R) + R.shape[1], dtype=bool)
+        if partly:
+            kept[: len(R)] = np.asarray(held).T.ravel()
+        singular = np.linalg.svd(R[kept[: len(R)]], compute_uv=False)
         if len(singular) < R.shape[1] or singular[-1] < 1e-9 * singular[0]:
             raise InputError(
                 f"the {len(fixed)} anchors do not hold the tissue alone; clamp points off one line, "
@@ -97,10 +108,11 @@ class AnchoredKernel:
                 raise InputError(f"every stiffness must be positive (or infinite); got {k.min()}")
             K = K + np.diag(np.tile(compliance(kernel, k) / scale**kernel.length_power, c))
         p = R.shape[1]
-        L = np.block([[K, R], [R.T, np.zeros((p, p))]])
-        table = np.ascontiguousarray(np.hstack([conditioned.matrix(x, B), conditioned.polynomial(x)]).T)
+        L = np.block([[K, R], [R.T, np.zeros((p, p))]])[np.ix_(kept, kept)]
+        every = np.hstack([conditioned.matrix(x, B), conditioned.polynomial(x)])
+        table = np.ascontiguousarray(every.T[kept])
         factors = lu_factor(L, check_finite=False)
-        return cls(conditioned, B, x, table, factors, centre, scale)
+        return cls(conditioned, B, x, table, factors, centre, scale, kept)
 
     @property
     def components(self) -> int:
@@ -118,8 +130,8 @@ class AnchoredKernel:
         return added
 
     def coupling(self, sources: Floats) -> Floats:
-        """L_B^-1 [U_By P_y]' for conditioned sources (m, 2), shape (b c + p, m c), interleaved columns."""
-        felt = _felt(self.kernel, sources, self.anchors)
+        """L_B^-1 [U_By P_y]' for conditioned sources (m, 2), shape (k, m c), interleaved columns."""
+        felt = self.felt_by(sources)
         held: Floats = lu_solve(self.factors, felt.T, check_finite=False)
         return held
 
@@ -137,8 +149,9 @@ class AnchoredKernel:
         return rows
 
     def felt_by(self, sources: Floats) -> Floats:
-        """[U_yB P_y] of conditioned sources (m, 2), shape (m c, b c + p)."""
-        return _felt(self.kernel, sources, self.anchors)
+        """[U_yB P_y] of conditioned sources (m, 2), shape (m c, k)."""
+        felt = np.hstack([self.kernel.matrix(sources, self.anchors), self.kernel.polynomial(sources)])
+        return np.ascontiguousarray(interleaved(felt[:, self.kept], self.components))
 
     def spline(self, sources: Floats, weights: Floats, coupling: Floats | None = None) -> Spline:
         """Return the field of weights (m c, 2 / c) at conditioned sources, anchors included, for any point.
@@ -146,7 +159,8 @@ class AnchoredKernel:
         ``coupling`` is that of the sources, where it is known already.
         """
         c = self.components
-        held = -(self.coupling(sources) if coupling is None else coupling) @ weights
+        held = np.zeros((len(self.kept), weights.shape[1]))
+        held[self.kept] = -(self.coupling(sources) if coupling is None else coupling) @ weights
         split = len(self.anchors) * c
         mobile = weights if c == 1 else blocks(weights)
         anchors = held[:split]
@@ -159,11 +173,6 @@ class AnchoredKernel:
         )
         landmarks = np.vstack([self.anchors, sources]) * self.scale + self.centre
         return Spline(self.kernel, landmarks, every, held[split:], self.centre, self.scale)
-
-
-def _felt(kernel: Kernel, points: Floats, anchors: Floats) -> Floats:
-    felt = np.hstack([kernel.matrix(points, anchors), kernel.polynomial(points)])
-    return np.ascontiguousarray(interleaved(felt, kernel.components))
 
 
 def interleaved(matrix: Floats, c: int) -> Floats:

@@ -1,34 +1,45 @@
 """The tissue model that the spline is compared with: finite elements under the same needle, section IV of the paper.
 
-The needle acts by forces: a cutting force at the tip and friction along the shaft, as consistent nodal loads
-wherever it lies. Between steps the tissue remembers only the loads that still act on it.
+The needle acts by forces: those of a needle that sticks, slips and cuts (`ForceModel`), or the paper's: a cutting force at the tip
+and viscous friction along the shaft, as consistent nodal loads wherever it lies. Between steps the tissue remembers the loads alone.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from echospline.errors import InputError
+from echospline.mechanics.fem_response import FEMResponse
 from echospline.mechanics.finite_elements import (
+    METHOD,
     Integration,
     Method,
-    factor,
     interpolate,
     line_loads,
     point_loads,
-    stiffness,
 )
-from echospline.mechanics.forces import NeedleForces, check_step, travelled
+from echospline.mechanics.force_model import ForceModel, ForceState
+from echospline.mechanics.forces import (
+    Forces,
+    NeedleForces,
+    NeedleLoad,
+    ViscousForces,
+    check_step,
+    travelled,
+)
 from echospline.mechanics.landmarks import Clamps
 from echospline.scene import ZERO_LENGTH, Floats, NeedlePose, RegularGrid, Tissue
 
 
 @dataclass(frozen=True)
 class FEMState:
-    """What the tissue remembers.
+    """What the tissue remembers under the viscous law.
 
     Attributes
     ----------
@@ -48,8 +59,11 @@ class FEMState:
     displacement: Floats
 
 
+State = FEMState | ForceState
+
+
 class FEMModel:
-    """Linear plane elasticity, clamped along edges, under a needle's forces; factored once, solved per step.
+    """Linear plane elasticity whose edges are clamped, slide or are free, under a needle's forces; factored once.
 
     Parameters
     ----------
@@ -57,14 +71,16 @@ class FEMModel:
         Nodes of the mesh.
     clamped : iterable of {"top", "bottom", "left", "right"}
         Edges held fast: the same along which the spline has its anchors.
+    sliding : iterable of the same names
+        Edges along which the tissue slides without friction: they hold the displacement across themselves.
     tissue : Tissue
         Moduli per region, thickness, plane stress or strain.
-    forces : NeedleForces
-        What the needle exerts.
-    solver : {"cholmod", "superlu"}
-        See `finite_elements.factor`.
+    forces : NeedleForces or ViscousForces
+        What the needle exerts: the law that sticks and slips, or the paper's.
     clamped_points : array_like, shape (k, 2), optional
         Further points held fast, mm: the mesh nodes nearest to them.
+    solver : {"cholmod", "superlu"}
+        See `finite_elements.factor`; CHOLMOD where it is installed, else SuperLU. ``model.factored.method`` says which.
     integration : {"full", "selective"}, optional
         See `finite_elements.stiffness`; by default selective where plane strain would lock, else full.
 
@@ -79,54 +95,67 @@ class FEMModel:
         grid: RegularGrid,
         clamped: Iterable[str] = ("left", "right", "bottom"),
         tissue: Tissue | None = None,
-        forces: NeedleForces | None = None,
+        forces: Forces | None = None,
         *,
+        sliding: Iterable[str] = (),
         clamped_points: ArrayLike | None = None,
-        solver: Method = "cholmod",
+        solver: Method = METHOD,
         integration: Integration | None = None,
     ) -> None:
-        self._grid = grid
-        self.tissue = tissue or Tissue()
-        self.forces = forces or NeedleForces()
-        self.clamped = Clamps.of(grid, clamped, clamped_points).nodes
-        young, poisson = self.tissue.in_cells(grid)
-        if integration is None:
-            integration = "selective" if self.tissue.plane == "strain" else "full"
-        self.stiffness = stiffness(
-            grid, young, poisson, self.tissue.thickness, self.tissue.plane, integration
+        self.tissue, self.forces = tissue or Tissue(), forces or NeedleForces()
+        clamps = Clamps.of(grid, clamped, clamped_points, sliding)
+        self.clamped = clamps.nodes
+        self.response = FEMResponse(grid, clamps, self.tissue, solver=solver, integration=integration)
+        self.stiffness, self.factored = self.response.stiffness, self.response.factored
+        self.needle = (
+            ForceModel(self.response, self.forces) if isinstance(self.forces, NeedleForces) else None
         )
-        self.factored = factor(self.stiffness, self.clamped, solver)
+        self._made = partial(
+            FEMModel, grid, clamps.edges, self.tissue, self.forces, clamped_points=clamps.points,
+            sliding=clamps.sliding, solver=solver, integration=integration,
+        )  # fmt: skip
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle what the model was made of."""
+        return self._made, ()
 
     @property
     def grid(self) -> RegularGrid:
         """The mesh."""
-        return self._grid
+        return self.response.grid
 
-    def rest(self) -> FEMState:
+    def rest(self) -> State:
         """Tissue that no needle has touched."""
+        if self.needle is not None:
+            return self.needle.rest()
         return FEMState(None, 0.0, np.zeros((self.grid.size, 2)), np.zeros((self.grid.size, 2)))
 
-    def advance(self, state: FEMState, pose: NeedlePose, dt: float) -> FEMState:
+    def advance(self, state: State, pose: NeedlePose, dt: float) -> State:
         """Loads of the new pose and the displacement under them, equation (23).
 
         Raises
         ------
         InputError
-            If dt is negative or not finite.
+            If dt is negative or not finite, or the state is of the other law.
         """
         check_step(dt)
+        if self.needle is not None and isinstance(state, ForceState):
+            return self.needle.advance(state, pose, dt)
+        law = self.forces
+        if not isinstance(law, ViscousForces) or not isinstance(state, FEMState):
+            raise InputError("this state belongs to a model with the other law of forces")
         travel = travelled(state.pose, pose)
-        friction = self.forces.advance_friction(state.friction, self.friction_loads(pose), travel, dt)
+        friction = law.advance_friction(state.friction, self.friction_loads(pose), travel, dt)
         inside = pose.depth >= ZERO_LENGTH and bool(self.grid.contains(pose.tip)[0])
-        tip = self.forces.advance_tip(state.tip, pose, travel, inside=inside)
+        tip = law.advance_tip(state.tip, pose, travel, inside=inside)
         displacement = self.factored.solve(friction + self.tip_loads(pose, tip))
         return FEMState(pose, tip, friction, displacement)
 
-    def displacement(self, state: FEMState) -> Floats:
+    def displacement(self, state: State) -> Floats:
         """Displacement of the nodes, shape (n, 2), mm."""
         return state.displacement
 
-    def displacement_at(self, state: FEMState, points: ArrayLike) -> Floats:
+    def displacement_at(self, state: State, points: ArrayLike) -> Floats:
         """Displacement of any reference points of the mesh, equation (22), shape (n, 2), mm.
 
         Raises
@@ -136,8 +165,33 @@ class FEMModel:
         """
         return interpolate(self.grid, state.displacement, points)
 
+    def needle_load(self, state: State) -> NeedleLoad:
+        """Return the needle's forces on the tissue."""
+        if isinstance(state, ForceState):
+            return state.load
+        if state.pose is None:
+            return NeedleLoad()
+        return NeedleLoad(state.tip, float(np.sum(state.friction @ np.array(state.pose.axis))))
+
+    def loads(self, state: State) -> Floats:
+        """Nodal loads (n, 2) in N that act on the tissue in a state."""
+        if isinstance(state, FEMState):
+            return (
+                state.friction
+                if state.pose is None
+                else state.friction + self.tip_loads(state.pose, state.tip)
+            )
+        total = np.zeros((self.grid.size, 2))
+        for answered, force in zip(state.track, state.forces, strict=True):
+            station = answered.station
+            if len(station.points):
+                total += point_loads(self.grid, station.points, station.weights[:, None] * force)
+        return total
+
     def friction_loads(self, pose: NeedlePose) -> Floats:
-        """Nodal loads (n, 2) in N of steady friction at this pose and speed."""
+        """Nodal loads (n, 2) in N of the viscous law's steady friction at this pose and speed."""
+        if not isinstance(self.forces, ViscousForces):
+            raise InputError("steady friction in proportion to speed is that of ViscousForces alone")
         return self.shaft_loads(pose, self.forces.friction * pose.speed)
 
     def shaft_loads(self, pose: NeedlePose, force_per_mm: float) -> Floats:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
+from importlib.util import find_spec
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -18,12 +19,14 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 from skfem import Basis, BilinearForm, ElementQuad1, ElementVector, MeshQuad
 
-from echospline.errors import InputError, SolverError
+from echospline.errors import InputError, MissingExtraError, SolverError
 from echospline.scene import Floats, RegularGrid, as_points
 
 Plane = Literal["stress", "strain"]
 Integration = Literal["full", "selective"]
 Method = Literal["cholmod", "superlu"]
+METHOD: Method = "cholmod" if find_spec("kvxopt") else "superlu"
+"""Default factorisation: CHOLMOD where the extra is installed; results and commands say which it was."""
 
 MPA = 1e-3
 """N/mm^2 per kPa."""
@@ -82,6 +85,7 @@ def stiffness(
     thickness: float,
     plane: Plane = "stress",
     integration: Integration = "full",
+    excess: tuple[NDArray[np.intp], Floats] | None = None,
 ) -> Any:
     """Assemble the global stiffness matrix K of equation (23).
 
@@ -98,6 +102,9 @@ def stiffness(
     integration : {"full", "selective"}
         "selective" takes the volumetric part at the element's centre only, which keeps nearly
         incompressible plane strain from locking.
+    excess : (cells, elasticity), optional
+        Elements that are stiffer than isotropic, and by how much: kPa, shape (c, 3, 3), of the strains (xx, yy, xy) with the
+        engineering shear. `cut_cells.elements_of` makes it.
 
     Returns
     -------
@@ -129,12 +136,20 @@ def stiffness(
     volumetric = whole if integration == "full" else Basis(mesh, whole.elem, quadrature=centre)
     scale = MPA * thickness
     K = _assemble(_shear, whole, scale * mu) + _assemble(_volume, volumetric, scale * lam)
+    if excess is not None and len(excess[0]):
+        some = Basis(mesh, whole.elem, intorder=2, elements=excess[0])
+        entries = {
+            f"d{i}{j}": np.repeat(excess[1][:, i, j, None], some.X.shape[-1], axis=1)
+            for i in range(3)
+            for j in range(3)
+        }
+        K = K + scale * BilinearForm(_anisotropic).assemble(some, **entries)
     return K.tocsc()
 
 
 @dataclass(frozen=True)
 class FactoredStiffness:
-    """K factored once with its clamped nodes taken out; `solve` is a back-substitution.
+    """K factored once with what is held taken out; `solve` is a back-substitution.
 
     Attributes
     ----------
@@ -155,9 +170,9 @@ class FactoredStiffness:
         Parameters
         ----------
         loads : array_like, shape (n, 2) or (n, 2, k)
-            Forces on the nodes, N; k load cases at once. Those on clamped nodes go into the clamp.
+            Forces on the nodes, N; k load cases at once. Those on held components go into what holds them.
         clamped_displacement : array_like, shape (n, 2), optional
-            Where the clamped nodes are held, mm; zero when not given.
+            Where held components are held, mm; zero when not given.
 
         Returns
         -------
@@ -216,41 +231,64 @@ class Compliance:
         return (self.columns @ loads[self.nodes].reshape(-1)).reshape(-1, 2)
 
 
-def factor(K: Any, clamped: ArrayLike, method: Method = "cholmod") -> FactoredStiffness:
-    """Factor the stiffness matrix with some nodes clamped.
+def factor(K: Any, held: ArrayLike, method: Method = METHOD) -> FactoredStiffness:
+    """Factor the stiffness matrix with some nodes, or some of their components, held.
 
     Parameters
     ----------
     K : sparse matrix, shape (2 n, 2 n)
         From `stiffness`, N/mm.
-    clamped : array_like of int
-        Nodes held in both directions; two or more, or the tissue could float away.
+    held : array_like of int, or of bool with shape (n, 2)
+        Nodes held in both directions, or which components (lateral, depth) of which nodes are held
+        (`Clamps.held`: an edge that slides holds one). No shift and no turn of the tissue as a whole may be left.
     method : {"cholmod", "superlu"}
-        "cholmod" (kvxopt) is the faster; "superlu" needs nothing but SciPy. Never swapped silently.
+        "cholmod" (kvxopt, an extra) is the faster on large meshes; "superlu" needs nothing but SciPy. The one named is used;
+        by default CHOLMOD where it is installed.
 
     Raises
     ------
     InputError
-        If the clamp leaves a rigid motion free, or the method is unknown or not installed.
+        If what is held leaves a shift free, or the method is unknown.
+    MissingExtraError
+        If it is "cholmod" and kvxopt is not installed.
     SolverError
         If the matrix is not positive definite.
     """
     if method not in get_args(Method):
         raise InputError(f"a factorisation is one of {', '.join(get_args(Method))}; got {method!r}")
-    held = np.unique(np.asarray(clamped, dtype=np.intp))
-    n = K.shape[0] // 2
-    if len(held) < 2 or held[0] < 0 or held[-1] >= n:
-        raise InputError(
-            f"two or more of the {n} nodes must be clamped, or the tissue floats away; got {len(held)}"
-        )
-    free = np.ones(2 * n, dtype=bool)
-    free[2 * held], free[2 * held + 1] = False, False
+    fixed = _components(np.asarray(held), K.shape[0] // 2)
+    free = ~fixed.ravel()
     if not free.any():
         raise InputError("every node is clamped; nothing is left to move")
     rows = K.tocsr()[free]
     inner = rows[:, free].tocsc()
     solve = _cholmod(inner) if method == "cholmod" else _superlu(inner)
     return FactoredStiffness(free, method, rows[:, ~free].tocsr(), solve)
+
+
+def _components(held: NDArray[Any], n: int) -> NDArray[np.bool_]:
+    """Return which components of n nodes are held, shape (n, 2)."""
+    if held.dtype != bool:
+        nodes = np.unique(held.astype(np.intp))
+        if len(nodes) < 2 or nodes[0] < 0 or nodes[-1] >= n:
+            raise InputError(
+                f"two or more of the {n} nodes must be clamped, or the tissue floats away; got {len(nodes)}"
+            )
+        held = np.zeros((n, 2), dtype=bool)
+        held[nodes] = True
+    if held.shape != (n, 2):
+        raise InputError(f"held components must be a boolean for each of {n} x 2; got shape {held.shape}")
+    for name, column in zip(("x", "y"), held.T, strict=True):
+        if not column.any():
+            raise InputError(
+                f"nothing holds the tissue along {name}: clamp an edge, or let one across {name} slide"
+            )
+    if held.sum() < 3:
+        raise InputError(
+            "three or more components must be held, or the tissue turns: clamp an edge or a second point"
+        )
+    fixed: NDArray[np.bool_] = held
+    return fixed
 
 
 def point_loads(grid: RegularGrid, points: ArrayLike, forces: ArrayLike) -> Floats:
@@ -340,6 +378,12 @@ def _shear(u: Any, v: Any, w: Any) -> Any:
     return w["modulus"] * (2 * exx * vxx + 2 * eyy * vyy + gxy * hxy)
 
 
+def _anisotropic(u: Any, v: Any, w: Any) -> Any:
+    """Strain : elasticity : strain of the weak form (21) with a matrix of moduli."""
+    e, f = _strain(u), _strain(v)
+    return sum(w[f"d{i}{j}"] * e[j] * f[i] for i in range(3) for j in range(3))
+
+
 def _volume(u: Any, v: Any, w: Any) -> Any:
     """Lambda tr(strain) tr(strain), the part of the weak form (21) that area changes cost."""
     return w["modulus"] * (u.grad[0][0] + u.grad[1][1]) * (v.grad[0][0] + v.grad[1][1])
@@ -356,8 +400,8 @@ def _cholmod(A: Any) -> Callable[[Floats], Floats]:
         kvxopt: Any = import_module("kvxopt")
         cholmod: Any = import_module("kvxopt.cholmod")
     except ImportError as missing:
-        raise InputError(
-            "method 'cholmod' needs the package kvxopt; install it or use 'superlu'"
+        raise MissingExtraError(
+            "kvxopt", "cholmod", "factoring by CHOLMOD (superlu needs nothing)"
         ) from missing
     lower = sparse.tril(A).tocoo()
     Ak = kvxopt.spmatrix(lower.data, lower.row.astype(int), lower.col.astype(int), A.shape)
@@ -371,7 +415,14 @@ def _cholmod(A: Any) -> Callable[[Floats], Floats]:
 
     def solve(rhs: Floats) -> Floats:
         x = kvxopt.matrix(np.asfortranarray(rhs))
-        cholmod.solve(numeric, x)
+        try:
+            cholmod.solve(numeric, x)
+        except (
+            ArithmeticError
+        ) as singular:  # a pivot of zero or less is reported here, not by the factorisation
+            raise SolverError(
+                "the stiffness matrix is not positive definite; check moduli and clamp"
+            ) from singular
         return np.array(x)
 
     return solve

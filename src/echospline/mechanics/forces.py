@@ -1,4 +1,4 @@
-"""The forces of a needle on tissue, and how they build up and relax: shared by all models that answer forces."""
+"""The laws of a needle's forces on tissue: one that sticks and slips, and the paper's viscous one."""
 
 from __future__ import annotations
 
@@ -8,12 +8,75 @@ from math import exp, isfinite
 import numpy as np
 
 from echospline.errors import InputError
-from echospline.scene import Floats, NeedlePose
+from echospline.scene import Floats, NeedlePose, is_number
 
 
 @dataclass(frozen=True)
 class NeedleForces:
-    """What the needle exerts on the tissue.
+    """A needle that sticks to the tissue, slips and cuts: the parameters of `mechanics.stick_slip`.
+
+    Only ``tip`` is from the paper. No force per length of shaft could be verified in a source; every number marked as assumed is
+    our own choice, in the range that makes friction a fifth to a third of the whole force.
+
+    Parameters
+    ----------
+    tip : float
+        Cutting force at the tip along the axis, N: at most this much pushes, and at this much the tip cuts. The paper's F = 0.4 N.
+    friction_limit : float
+        Greatest friction per mm of shaft in the tissue, N/mm, reached when it slips. Assumed; 0.005 to 0.02 are plausible.
+    bond : float
+        Stiffness of the bond between shaft and tissue per mm of shaft, N/mm^2. Assumed, a penalty: shaft and tissue slip
+        after friction_limit / bond = 0.1 mm, and the visible stick comes from the tissue.
+    tip_stiffness : float
+        Of the contact between tip and tissue, N/mm. Assumed, a penalty as the bond.
+    side_stiffness : float
+        Of the contact across the shaft per mm of shaft, N/mm^2. Assumed, a penalty: tilting moves the tissue along.
+    viscosity : float
+        What friction gains per mm of shaft and mm/s of slip beyond its limit, N s/mm^2. 0 by default: in agarose forces hardly
+        differ from 1.8 to 10 mm/s. 5e-4 shows speed. Assumed.
+    station_spacing : float
+        Distance between the points of the track that carry forces, mm: the resolution of the law along the shaft.
+    substep : float
+        Longest travel that is solved at once, mm; a step that goes further is divided.
+    dead_band : float
+        Play in the depth, mm to either side: a tip that moves less along the axis is at rest. 0 by default; 0.15 suits a tracker
+        with 0.05 mm of noise.
+
+    Raises
+    ------
+    InputError
+        If a number is out of its range.
+    """
+
+    tip: float = 0.4
+    friction_limit: float = 0.01
+    bond: float = 0.1
+    tip_stiffness: float = 2.0
+    side_stiffness: float = 1.0
+    viscosity: float = 0.0
+    station_spacing: float = 1.25
+    substep: float = 0.25
+    dead_band: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, unit in (
+            ("tip", "N"), ("friction_limit", "N/mm"), ("viscosity", "N s/mm^2"), ("dead_band", "mm"),
+        ):  # fmt: skip
+            value = getattr(self, name)
+            if not (isfinite(value) and value >= 0):
+                raise InputError(f"{name} must be zero or a positive number in {unit}; got {value}")
+        for name, unit in (
+            ("bond", "N/mm^2"), ("tip_stiffness", "N/mm"), ("side_stiffness", "N/mm^2"),
+            ("station_spacing", "mm"), ("substep", "mm"),
+        ):  # fmt: skip
+            value = getattr(self, name)
+            if not (isfinite(value) and value > 0):
+                raise InputError(f"{name} must be a positive number in {unit}; got {value}")
+
+
+@dataclass(frozen=True)
+class ViscousForces:
+    """The paper's needle: a force at the tip, and friction in proportion to speed that relaxes at rest.
 
     Parameters
     ----------
@@ -79,6 +142,35 @@ class NeedleForces:
         return after
 
 
+Forces = NeedleForces | ViscousForces
+"""Either law."""
+
+
+@dataclass(frozen=True, slots=True)
+class NeedleLoad:
+    """What the needle exerts on the tissue at one instant.
+
+    Parameters
+    ----------
+    tip : float
+        Force of the tip along the axis, N; never negative.
+    friction : float
+        Sum of the friction along the axis, N; positive where the needle pushes the tissue along, negative on withdrawal.
+    side : float
+        Sum of the forces across the axis, N; positive towards (-axis_y, axis_x).
+    torque : float
+        Of all forces about the point of entry, N mm; positive turns x towards y.
+    cut : float
+        Length of track that has been cut so far, mm from the surface. The viscous law keeps none: 0.
+    """
+
+    tip: float = 0.0
+    friction: float = 0.0
+    side: float = 0.0
+    torque: float = 0.0
+    cut: float = 0.0
+
+
 def travelled(before: NeedlePose | None, after: NeedlePose) -> float:
     """Longest way that a point of the shaft has gone, mm; from the entry if there was no needle before."""
     if before is None:
@@ -89,5 +181,5 @@ def travelled(before: NeedlePose | None, after: NeedlePose) -> float:
 
 def check_step(dt: float) -> None:
     """Refuse a time step that is negative or not finite."""
-    if not (isfinite(dt) and dt >= 0):
-        raise InputError(f"dt must be zero or a positive number in s; got {dt}")
+    if not (is_number(dt) and dt >= 0):
+        raise InputError(f"dt must be zero or a positive number in s; got {dt!r}")

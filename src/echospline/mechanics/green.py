@@ -1,29 +1,39 @@
 """The tissue model between spline and finite elements: Green's function under the needle's forces.
 
-Landmarks and kernels as in the spline, forces as in finite elements. Anchors hold the clamped edges; the tip's
-force and the friction along the shaft act where the needle is, through the fundamental solution of elasticity
-under a free surface. There is no mesh to solve and nothing to identify that a finite-element model would not
-need too: Young's modulus, Poisson's ratio and forces.
+The tip's force and the friction along the shaft act where the needle is, and the field of each is `green_response`: closed forms
+for homogeneous tissue, layers and round lesions, a live solve for any other. There is nothing to identify that a finite-element
+model would not need too: Young's modulus, Poisson's ratio and forces.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from echospline.errors import InputError
-from echospline.mechanics.forces import NeedleForces, check_step, travelled
-from echospline.mechanics.half_plane import GreensFunction
+from echospline.mechanics.force_model import ForceModel, ForceState
+from echospline.mechanics.forces import (
+    Forces,
+    NeedleForces,
+    NeedleLoad,
+    ViscousForces,
+    check_step,
+    travelled,
+)
+from echospline.mechanics.green_response import GreenMethod, GreenResponse, green_response
 from echospline.mechanics.landmarks import Clamps
 from echospline.scene import ZERO_LENGTH, Floats, NeedlePose, RegularGrid, Tissue
 
 
 @dataclass(frozen=True)
 class GreenState:
-    """What the tissue remembers.
+    """What the tissue remembers under the viscous law.
 
     Attributes
     ----------
@@ -46,34 +56,44 @@ class GreenState:
     displacement: Floats
 
 
+State = GreenState | ForceState
+
+
 class GreenModel:
-    """Homogeneous elastic tissue under a needle's forces, by superposition of point forces.
+    """Elastic tissue under a needle's forces, by superposition of point forces.
 
     Parameters
     ----------
     grid : RegularGrid
-        Nodes of the mesh on which the field is wanted.
+        Nodes of the mesh on which the field is wanted; its extent is the tissue.
     clamped : iterable of {"top", "bottom", "left", "right"}
-        Edges that anchors hold. A top that is not clamped is a free surface; tissue goes on beyond any other
-        edge that is not clamped.
+        Edges that do not move.
     tissue : Tissue
-        Homogeneous; E, nu, thickness, plane stress or strain.
-    forces : NeedleForces
-        What the needle exerts.
+        Moduli per region, thickness, plane stress or strain.
+    forces : NeedleForces or ViscousForces
+        What the needle exerts: the law that sticks and slips, or the paper's.
+    sliding : iterable of {"top", "bottom", "left", "right"}
+        Edges that move along themselves alone; any other is free.
     clamped_points : array_like, shape (k, 2), optional
-        Further anchors, mm.
+        Points that do not move, mm: pins of ``radius``.
     radius : float
         Over which a force is spread, mm; by default about the radius of an 18 gauge needle. The field near the
         tip depends on it, the field elsewhere does not.
-    anchor_spacing : float
-        Greatest distance between anchors, mm.
+    method : {"auto", "boundary", "regions", "solve"}
+        See `green_response`.
     station_spacing : float
-        Distance along the shaft between the points that carry friction, mm.
+        Of the viscous law: distance along the shaft between the points that carry friction, mm.
+
+    Attributes
+    ----------
+    response : GreenResponse
+        What answers forces; its `describe` tells how. Where forces go beyond its limits, `warnings.warn` gives the sentence of
+        `GreenResponse.warnings`, each once per model.
 
     Raises
     ------
     InputError
-        If the tissue has regions, or a number is out of its range.
+        If nothing holds the tissue, the method cannot represent it, or a number is out of its range.
     """
 
     def __init__(
@@ -81,81 +101,96 @@ class GreenModel:
         grid: RegularGrid,
         clamped: Iterable[str] = ("left", "right", "bottom"),
         tissue: Tissue | None = None,
-        forces: NeedleForces | None = None,
+        forces: Forces | None = None,
         *,
+        sliding: Iterable[str] = (),
         clamped_points: ArrayLike | None = None,
         radius: float = 0.4,
-        anchor_spacing: float = 1.5,
+        method: GreenMethod = "auto",
         station_spacing: float = 1.0,
     ) -> None:
         self._grid = grid
-        self.tissue = tissue or Tissue()
-        self.forces = forces or NeedleForces()
-        if not self.tissue.homogeneous:
-            raise InputError(
-                "Green's function is that of homogeneous tissue; for tissue with regions use finite elements (fem)"
-            )
+        self.tissue, self.forces = tissue or Tissue(), forces or NeedleForces()
         if not (np.isfinite(station_spacing) and station_spacing > 0):
             raise InputError(f"station_spacing must be a positive number in mm; got {station_spacing}")
-        edges = tuple(clamped)
         self.station_spacing = station_spacing
-        self.green = GreensFunction(
-            Clamps.of(grid, edges, clamped_points).anchors(anchor_spacing),
-            self.tissue.young,
-            self.tissue.poisson,
-            self.tissue.thickness,
-            self.tissue.plane,
-            radius,
-            anchor_spacing / (2.0 * np.pi),
-            None if "top" in edges else grid.origin[1],
+        clamps = Clamps.of(grid, clamped, clamped_points, sliding)
+        self.response: GreenResponse = green_response(grid, clamps, self.tissue, radius=radius, method=method)
+        self.needle = (
+            ForceModel(self.response, self.forces) if isinstance(self.forces, NeedleForces) else None
         )
-        self._projector = self.green.projector(grid.nodes)
+        self._warned: set[str] = set()
+        self._made = partial(
+            GreenModel, grid, clamps.edges, self.tissue, self.forces, clamped_points=clamps.points,
+            sliding=clamps.sliding, radius=radius, method=method, station_spacing=station_spacing,
+        )  # fmt: skip
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle what the model was made of."""
+        return self._made, ()
 
     @property
     def grid(self) -> RegularGrid:
         """The mesh."""
         return self._grid
 
-    def rest(self) -> GreenState:
+    def rest(self) -> State:
         """Tissue that no needle has touched."""
+        if self.needle is not None:
+            return self.needle.rest()
         n = self.grid.size
         return GreenState(None, 0.0, np.zeros(0), np.zeros((2 * n, 0)), np.zeros((n, 2)))
 
-    def advance(self, state: GreenState, pose: NeedlePose, dt: float) -> GreenState:
+    def advance(self, state: State, pose: NeedlePose, dt: float) -> State:
         """Forces of the new pose and the field under them.
 
         Raises
         ------
         InputError
-            If dt is negative or not finite.
+            If dt is negative or not finite, or the state is of the other law.
         """
         check_step(dt)
+        if self.needle is not None and isinstance(state, ForceState):
+            after = self.needle.advance(state, pose, dt)
+            if after.load.tip > 0 and len(after.track) != len(
+                state.track
+            ):  # the tip has come to another place
+                self._warn(np.array([pose.tip]), after.load.tip * np.array([pose.axis]))
+            return after
+        law = self.forces
+        if not isinstance(law, ViscousForces) or not isinstance(state, GreenState):
+            raise InputError("this state belongs to a model with the other law of forces")
         travel = travelled(state.pose, pose)
         inside = pose.depth >= ZERO_LENGTH and bool(self.grid.contains(pose.tip)[0])
-        tip = self.forces.advance_tip(state.tip, pose, travel, inside=inside)
+        tip = law.advance_tip(state.tip, pose, travel, inside=inside)
         columns, covered, ahead = self._columns(state, pose, push=tip != 0)
         before = np.zeros((columns.shape[1], 1))
         kept = min(len(state.friction), len(before))
         before[:kept, 0] = state.friction[:kept]
-        steady = np.full_like(before, self.forces.friction * pose.speed)
-        friction = self.forces.advance_friction(before, steady, travel, dt)[:, 0]
+        steady = np.full_like(before, law.friction * pose.speed)
+        friction = law.advance_friction(before, steady, travel, dt)[:, 0]
         field = columns @ (friction * covered)
         if ahead is not None:
             field = field + ahead * tip
+            self._warn(np.array([pose.tip]), tip * np.array([pose.axis]))
         return GreenState(pose, tip, friction, columns, _vectors(field))
 
-    def displacement(self, state: GreenState) -> Floats:
+    def displacement(self, state: State) -> Floats:
         """Displacement of the nodes, shape (n, 2), mm."""
         return state.displacement
 
-    def displacement_at(self, state: GreenState, points: ArrayLike) -> Floats:
+    def displacement_at(self, state: State, points: ArrayLike) -> Floats:
         """Displacement of any reference points in the tissue, shape (n, 2), mm.
 
         Raises
         ------
         InputError
-            If a point lies above the free surface.
+            If a point lies outside the tissue.
         """
+        if isinstance(state, ForceState):
+            if self.needle is None:
+                raise InputError("this state belongs to a model with the other law of forces")
+            return self.needle.displacement_at(state, points)
         p = np.atleast_2d(np.asarray(points, dtype=np.float64))
         if state.pose is None or state.pose.depth < ZERO_LENGTH:
             return np.zeros(p.shape)
@@ -165,9 +200,17 @@ class GreenModel:
             sources, forces = np.vstack([sources, state.pose.tip]), np.append(forces, state.tip)
         if not forces.any():
             return np.zeros(p.shape)
-        axis = np.array(state.pose.axis)
-        G = self.green.columns(p, sources)
-        return _vectors(G @ np.concatenate([forces * axis[0], forces * axis[1]]))
+        loads = forces[:, None, None] * np.array(state.pose.axis)[:, None]
+        at: Floats = self.response.answer(sources, loads, p)[1][:, :, 0]
+        return at
+
+    def needle_load(self, state: State) -> NeedleLoad:
+        """Return the needle's forces on the tissue."""
+        if isinstance(state, ForceState):
+            return state.load
+        if state.pose is None:
+            return NeedleLoad()
+        return NeedleLoad(state.tip, float(state.friction @ self.stations(state.pose)[1]))
 
     def stations(self, pose: NeedlePose) -> tuple[Floats, Floats]:
         """Points (k, 2) of the shaft that carry friction, mm, and the length (k,) in mm that each stands for."""
@@ -210,10 +253,17 @@ class GreenModel:
 
     def _axial(self, sources: Floats, pose: NeedlePose) -> Floats:
         """Displacement of the nodes by unit forces along the axis at sources (k, 2), shape (2 n, k), mm/N."""
-        G = self.green.columns(self.grid.nodes, sources, self._projector)
         k = len(sources)
-        axial: Floats = G[:, :k] * pose.axis[0] + G[:, k:] * pose.axis[1]
-        return axial
+        unit = np.eye(k)[:, None, :] * np.array(pose.axis)[:, None]
+        mesh = self.response.answer(sources, unit, np.zeros((0, 2)))[0]
+        return mesh.transpose(1, 0, 2).reshape(-1, k)
+
+    def _warn(self, places: Floats, forces: Floats) -> None:
+        """Say once per model what goes beyond the limits of the response."""
+        for kind, sentence in self.response.warnings(places, forces).items():
+            if kind not in self._warned:
+                self._warned.add(kind)
+                warnings.warn(sentence, stacklevel=3)
 
 
 def _vectors(blocks: Floats) -> Floats:

@@ -14,11 +14,17 @@ import numpy as np
 
 from echospline.scene import Floats
 
-LET_GO = 1e-4
+LET_GO = 2e-5
 """mm; a landmark that has left the needle is dropped once it is this close to the field without it."""
 
 CALM = 2.5
-"""A step moves no node further than this times the needle's travel and the relaxation due (``loading="follow"``)."""
+"""A step moves no node further than this times the needle's travel and the relaxation due, but where friction is at once."""
+
+SUBSTEP = 0.25
+"""mm of the needle's travel after which a step looks again at who touches it: longer ones would depend on the time step."""
+
+MOST_SUBSTEPS = 100
+"""In one step; a needle that moves further than this many times `SUBSTEP` at once has been put elsewhere, not moved."""
 
 
 class Pose(Protocol):
@@ -89,15 +95,77 @@ def relax(q: Floats, target: Floats, alpha3: float, dt: float) -> Floats:
     return relaxed
 
 
-def approach(q: Floats, target: Floats, travel: float) -> Floats:
-    """Move displacements (k, D) towards their targets, none further than ``travel`` (mm)."""
+def approach(q: Floats, target: Floats, travel: Floats | float) -> Floats:
+    """Move displacements (k, D) towards their targets, none further than ``travel`` (mm, one for all or (k,))."""
     gap = target - q
     share = np.minimum(1.0, travel / np.maximum(np.linalg.norm(gap, axis=1), 1e-300))
     moved: Floats = q + gap * share[:, None]
     return moved
 
 
-def load(q: Floats, f: Floats, side: Floats, axis: Floats, alpha3: float, dt: float, travel: float) -> Floats:
+def yielding(f: Floats, clearance: Floats) -> Floats:
+    """Displacement that friction or the tip asks for beside what is clamped, mm: it fades over five times itself.
+
+    Tissue beside a clamp cannot follow. A landmark there that did would give the spline a slope at the clamp, which a thin plate
+    carries far away; so the displacement begins with the fourth power of the distance, and grows by 0.4 mm per mm at most.
+
+    Parameters
+    ----------
+    f : ndarray, shape (k,)
+        Displacement asked for in the open, mm.
+    clearance : ndarray, shape (k,)
+        Distance to what is clamped, mm.
+    """
+    reach = 5.0 * np.abs(f)
+    near = np.divide(clearance, reach, out=np.ones_like(f), where=clearance < reach)
+    step = near * near * (3.0 - 2.0 * near)
+    faded: Floats = f * step * step
+    return faded
+
+
+def stick(
+    q: Floats, held: Floats, moved: Floats, side: Floats, axis: Floats, travel: Floats | float
+) -> Floats:
+    """New displacements of landmarks that stick to the shaft and slip beyond what friction holds.
+
+    Along the axis this is the stop operator of Coulomb friction on displacements, q <- min(max(q + moved, -held), held): at rest
+    nothing changes, and a needle that turns back drags the tissue back through zero, whatever the time step. Across the axis
+    a landmark follows the shaft.
+
+    Parameters
+    ----------
+    q : ndarray, shape (k, D)
+        Displacements so far, mm.
+    held : ndarray, shape (k,)
+        Largest displacement along the axis that friction holds, mm, zero or more.
+    moved : ndarray, shape (k,)
+        Motion of the shaft along its axis while it touched each landmark, mm; negative on withdrawal.
+    side : ndarray, shape (k, D)
+        Displacement across the axis that the shaft asks for, mm.
+    axis : ndarray, shape (D,)
+        Unit vector from entry to tip.
+    travel : ndarray, shape (k,), or float
+        Longest way that a point of the needle has moved meanwhile, mm: a landmark moves no further.
+
+    Returns
+    -------
+    ndarray, shape (k, D)
+        mm.
+    """
+    along = np.clip(q @ axis + moved, -held, held)
+    return approach(q, along[:, None] * axis + side, travel)
+
+
+def load(
+    q: Floats,
+    f: Floats,
+    side: Floats,
+    axis: Floats,
+    alpha3: float,
+    dt: float,
+    travel: Floats | float,
+    most: float = inf,
+) -> Floats:
     """New displacements of the landmarks in contact.
 
     Along the axis a landmark is loaded while friction asks for more than it has in friction's direction; then it
@@ -116,9 +184,11 @@ def load(q: Floats, f: Floats, side: Floats, axis: Floats, alpha3: float, dt: fl
         Unit vector from entry to tip.
     alpha3, dt : float
         Rate (1/s) and time (s) of relaxation.
-    travel : float
-        Longest way that a point of the needle has moved in the step, mm; infinite is the printed law: at once f
+    travel : ndarray, shape (k,), or float
+        Longest way that a point of the needle has moved meanwhile, mm; infinite is the printed law: at once f
         while there is friction, relaxation only without.
+    most : float
+        Displacement along the axis beyond which a landmark comes back as the needle travels, mm.
 
     Returns
     -------
@@ -129,7 +199,7 @@ def load(q: Floats, f: Floats, side: Floats, axis: Floats, alpha3: float, dt: fl
     loading = (np.sign(f) * (f - along) > 0) | (np.isinf(travel) & (f != 0))
     relaxed = np.where(loading, along, relax(along, f, alpha3, dt))
     rested = q + (relaxed - along)[:, None] * axis
-    target = np.where(loading, f, relaxed)[:, None] * axis + side
+    target = np.clip(np.where(loading, f, relaxed), -most, most)[:, None] * axis + side
     return approach(rested, target, travel)
 
 

@@ -1,7 +1,8 @@
 """Kernels of landmark splines: what one landmark does to a point elsewhere, in the plane and in space.
 
-Two are here. `ThinPlate` is the paper's, equation (3): one scalar serves all components of the displacement.
-`Elastic` is the regularised fundamental solution of elasticity: a matrix couples the components.
+Two are here. `ThinPlate` is the paper's, equation (3): one scalar serves all components of the displacement (`Apart` is the same
+where landmarks hold some components and leave others free). `Elastic` is the regularised fundamental solution of elasticity: a
+matrix couples the components.
 """
 
 from __future__ import annotations
@@ -49,6 +50,10 @@ class Kernel(Protocol):
 
     def scaled(self, length: float) -> Kernel:
         """Return the kernel for coordinates divided by ``length`` mm."""
+        ...
+
+    def apart(self) -> Kernel:
+        """Return the same kernel with D components, for landmarks that hold some components and leave others free."""
         ...
 
     def matrix(self, points: Floats, sources: Floats) -> Floats:
@@ -126,6 +131,10 @@ class ThinPlate:
         """Return itself: a change of unit adds r^2 times a constant, which the side conditions turn affine, or only scales."""
         return self
 
+    def apart(self) -> Apart:
+        """Return the kernel that treats the components apart."""
+        return Apart(self)
+
     def matrix(self, points: Floats, sources: Floats) -> Floats:
         """U(r), shape (n, m), equation (4)."""
         _, r2 = _offsets(points, sources)
@@ -151,6 +160,70 @@ class ThinPlate:
         for j in range(D):
             gradient[j, :, j + 1] = 1.0
         return gradient
+
+
+@dataclass(frozen=True)
+class Apart:
+    """A thin plate per component of the displacement, each with anchors of its own.
+
+    Where all landmarks hold every component this gives the numbers of `ThinPlate`, at D^2 times the work.
+
+    Parameters
+    ----------
+    plate : ThinPlate
+        The scalar kernel.
+    """
+
+    plate: ThinPlate
+
+    @property
+    def dimension(self) -> Dimension:
+        """That of the plate."""
+        return self.plate.dimension
+
+    @property
+    def components(self) -> int:
+        """D."""
+        return self.plate.dimension
+
+    @property
+    def length_power(self) -> int:
+        """That of the plate."""
+        return self.plate.length_power
+
+    @property
+    def per_spring(self) -> float:
+        """That of the plate."""
+        return self.plate.per_spring
+
+    def scaled(self, length: float) -> Apart:
+        """Return itself, as the plate does."""
+        return self
+
+    def apart(self) -> Apart:
+        """Return itself."""
+        return self
+
+    def matrix(self, points: Floats, sources: Floats) -> Floats:
+        """U(r) for every component, no component acting on another, shape (D n, D m)."""
+        return self._each(self.plate.matrix(points, sources))
+
+    def gradient(self, points: Floats, sources: Floats) -> Floats:
+        """Derivatives of `matrix` by the coordinates, shape (D, D n, D m)."""
+        return np.stack([self._each(by) for by in self.plate.gradient(points, sources)])
+
+    def polynomial(self, points: Floats) -> Floats:
+        """Affine motions of every component, shape (D n, D (D + 1))."""
+        return self._each(self.plate.polynomial(points))
+
+    def polynomial_gradient(self, points: Floats) -> Floats:
+        """Return the derivatives of the affine motions, shape (D, D n, D (D + 1))."""
+        return np.stack([self._each(by) for by in self.plate.polynomial_gradient(points)])
+
+    def _each(self, block: Floats) -> Floats:
+        """Blocks along a diagonal, one per component."""
+        blocks: Floats = np.kron(np.eye(self.dimension), block).astype(np.float64, copy=False)
+        return blocks
 
 
 @dataclass(frozen=True)
@@ -226,6 +299,10 @@ class Elastic:
     def scaled(self, length: float) -> Elastic:
         """Return the kernel for coordinates divided by ``length``; the constant or factor that this adds does no work."""
         return replace(self, radius=self.radius / length)
+
+    def apart(self) -> Elastic:
+        """Return itself: it has D components."""
+        return self
 
     def matrix(self, points: Floats, sources: Floats) -> Floats:
         """Field of unit forces, (own I + both x x') per point and source, shape (D n, D m)."""

@@ -6,15 +6,17 @@ import numpy as np
 
 from echospline.mechanics.anchored_kernel import AnchoredKernel
 from echospline.mechanics.kernels import Kernel
+from echospline.mechanics.landmarks import Anchors
 from echospline.scene import Floats, RegularGrid, Tissue
 
 
-def landmark_stiffness(tissue: Tissue, grid: RegularGrid, kernel: Kernel, anchors: Floats) -> Floats:
+def landmark_stiffness(tissue: Tissue, grid: RegularGrid, kernel: Kernel, anchors: Anchors) -> Floats:
     """Stiffness per mesh node of an approximating spline, from Young's modulus there.
 
     A needle that pushes with the same force moves tissue in inverse proportion to its modulus. For one landmark alone
     the spline moves by G / (G + 16 pi / k) of what is asked, with G its own response under the anchors; this is
-    E_min / E for 16 pi / k = G (E / E_min - 1). Where the tissue is softest the landmark interpolates.
+    E_min / E for 16 pi / k = G (E / E_min - 1). Where the tissue is softest the landmark interpolates. G is the mean over the
+    components: near a sliding edge one of them answers more than the other.
 
     Parameters
     ----------
@@ -24,8 +26,8 @@ def landmark_stiffness(tissue: Tissue, grid: RegularGrid, kernel: Kernel, anchor
         Mesh; a node in its clamped edges interpolates.
     kernel : Kernel
         Of the spline.
-    anchors : ndarray, shape (b, 2)
-        mm.
+    anchors : Anchors
+        From `Clamps.anchors`.
 
     Returns
     -------
@@ -38,8 +40,8 @@ def landmark_stiffness(tissue: Tissue, grid: RegularGrid, kernel: Kernel, anchor
     stiff = np.flatnonzero(excess > 0)
     if not len(stiff):
         return stiffness
-    scene = AnchoredKernel.factor(kernel, anchors, grid.nodes[:1])
-    c, unit = kernel.components, scene.scale**kernel.length_power
+    scene = AnchoredKernel.factor(kernel, anchors.places, grid.nodes[:1], held=anchors.held)
+    c, unit = scene.components, scene.scale**kernel.length_power
     for i in stiff:
         x = scene.conditioned(grid.nodes[i : i + 1])
         own = abs(float(np.trace(scene.between(x, x)))) / c * unit

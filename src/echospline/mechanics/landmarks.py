@@ -17,6 +17,9 @@ from echospline.scene import EDGES, Floats, as_points
 SIDES = {"left": (0, 0), "right": (0, 1), "top": (1, 0), "bottom": (1, 1), "front": (2, 0), "back": (2, 1)}
 """Axis, and 0 where its coordinate is least or 1 where it is greatest, of every edge (plane) or face (space)."""
 
+ALONG = 1e9
+"""mm; a sliding edge further away than this along the needle is not ahead of it: the needle runs along the edge."""
+
 
 class Mesh(Protocol):
     """Points at constant spacing, x fastest, in the plane (`RegularGrid`) or in space: D numbers each."""
@@ -47,7 +50,26 @@ class Mesh(Protocol):
 
 
 MOST_ANCHORS = 1500
-"""Anchors of a scene at most: their system is a full matrix, and 1500 take seconds to factor."""
+"""Anchors of a scene at most, on clamped and sliding edges together: their system is a full matrix, and 1500 take seconds to factor."""
+
+
+@dataclass(frozen=True)
+class Anchors:
+    """Landmarks that stay: places, and which components of the displacement each of them holds at zero.
+
+    Parameters
+    ----------
+    places : ndarray, shape (b, D)
+        mm.
+    held : ndarray of bool, shape (b, D)
+        All components on a clamped edge, the normal one alone on a sliding edge.
+    """
+
+    places: Floats
+    held: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.places)
 
 
 @dataclass(frozen=True)
@@ -171,38 +193,116 @@ class Clamps:
             f"edge, for example {'the bottom' if 'bottom' not in self.sliding else 'the bottom instead of letting it slide'}"
         )
 
-    def anchors(self, spacing: float) -> Floats:
-        """Anchor landmarks along the clamped edges, at most ``spacing`` mm apart, shape (b, D) mm.
+    def anchors(self, spacing: float, *, affine: bool = False) -> Anchors:
+        """Anchor landmarks along the clamped and the sliding edges, at most ``spacing`` mm apart; then the clamped points.
 
         In a face they form a lattice, ``spacing`` mm apart along each direction.
+
+        Parameters
+        ----------
+        spacing : float
+            mm.
+        affine : bool
+            Whether every affine motion is free of energy, as it is for a thin plate. Anchors of one component along one
+            edge alone leave it free to tilt about that edge. A second row, one spacing outside the mesh, then holds its slope.
+
+        Raises
+        ------
+        InputError
+            If the anchors would be too many, or a component that no edge holds is left free by the clamped points.
         """
         low, high = _extent(self.grid)
+        rows = [(edge, 0.0, self._holds(edge)) for edge in (*self.edges, *self.sliding)]
+        if affine:
+            for edge in (*self.edges, *self.sliding):
+                slope = self._holds(edge) & self._tilts_about(edge, spacing)
+                if slope.any():
+                    rows.append((edge, spacing, slope))
         gaps = np.maximum(1.0, np.ceil((high - low) / spacing - 1e-9)) + 1.0
-        count = len(self.points) + sum(np.prod(np.delete(gaps, SIDES[edge][0])) for edge in self.edges)
+        count = len(self.points) + sum(np.prod(np.delete(gaps, SIDES[edge][0])) for edge, _, _ in rows)
         if count > MOST_ANCHORS:
             size = " x ".join(f"{width:g}" for width in high - low)
             raise InputError(
-                f"anchors {spacing:g} mm apart along what is clamped may be {MOST_ANCHORS} at most; a mesh of {size} mm needs "
+                f"anchors {spacing:g} mm apart along what is held may be {MOST_ANCHORS} at most; a mesh of {size} mm needs "
                 f"{count:.0f}: check the image's spacing in mm, or raise anchor_spacing"
             )
-        every = []
-        for axis, side in (SIDES[edge] for edge in self.edges):
+        if affine:
+            self._refuse_tilting()
+        every, held = [], []
+        for edge, outside, components in rows:
+            axis, side = SIDES[edge]
             lines = [_line(a, b, spacing) for a, b in zip(low, high, strict=True)]
-            lines[axis] = (high if side else low)[axis : axis + 1]
+            end = high[axis] + outside if side else low[axis] - outside
+            lines[axis] = np.array([end])
             every.append(_product(lines))
+            held.append(np.broadcast_to(components, every[-1].shape))
         landmarks = np.vstack([*every, self.points])
-        _, first = np.unique(np.round(landmarks / 1e-6), axis=0, return_index=True)
-        distinct: Floats = landmarks[np.sort(first)]
-        return distinct
+        components = np.vstack([*held, np.ones(self.points.shape, dtype=bool)])
+        _, first, same = np.unique(np.round(landmarks / 1e-6), axis=0, return_index=True, return_inverse=True)
+        together = np.zeros((len(first), len(low)), dtype=bool)
+        np.logical_or.at(together, same.ravel(), components)
+        order = np.argsort(first)
+        return Anchors(landmarks[first[order]], together[order])
 
-    def clearance(self, point: Sequence[float]) -> float:
-        """Distance in mm from a point to what is clamped; 0 on it and beyond it; infinite when nothing is."""
+    def clearance(self, point: Sequence[float], axis: Sequence[float] | Floats) -> float:
+        """Distance in mm over which a needle can push; 0 at what is held and beyond it; infinite where nothing is.
+
+        It is the distance from the tip to what is clamped. A sliding edge stops no more than the part of a push along its
+        normal, so the distance to it counts along the needle: for a needle at right angles to the edge it is that to a
+        clamped one, and for a needle along the edge it is infinite. The normal part of the push then fades with a slope
+        that does not depend on the angle.
+
+        Parameters
+        ----------
+        point : sequence of float
+            The tip, mm.
+        axis : sequence of float
+            Unit vector from entry to tip, or zeros.
+        """
         low, high = _extent(self.grid)
         distances = []
-        for axis, side in (SIDES[edge] for edge in self.edges):
-            distances.append(high[axis] - point[axis] if side else point[axis] - low[axis])
-        distances += [np.linalg.norm(p - point) for p in self.points]
+        for edge in (*self.edges, *self.sliding):
+            d, side = SIDES[edge]
+            gap = float(high[d] - point[d] if side else point[d] - low[d])
+            if edge in self.sliding and gap > 0:
+                steep = abs(float(axis[d]))
+                gap = gap / steep if gap < ALONG * steep else inf
+            distances.append(gap)
+        distances += [float(np.linalg.norm(p - point)) for p in self.points]
         return max(0.0, float(min(distances, default=inf)))
+
+    def _holds(self, edge: str) -> NDArray[np.bool_]:
+        """Components that a clamped or sliding edge holds."""
+        held = np.full(len(self.grid.shape), edge in self.edges)
+        held[SIDES[edge][0]] = True
+        return held
+
+    def _tilts_about(self, edge: str, spacing: float) -> NDArray[np.bool_]:
+        """Components that no other edge holds, and no clamped point further than one spacing from this one."""
+        low, high = _extent(self.grid)
+        axis, side = SIDES[edge]
+        others = [self._holds(other) for other in (*self.edges, *self.sliding) if other != edge]
+        reach = np.abs(self.points[:, axis] - (high if side else low)[axis]) if len(self.points) else []
+        alone: NDArray[np.bool_] = ~np.any(others, axis=0) if others else np.ones(len(low), dtype=bool)
+        return alone & (not np.any(np.asarray(reach) > spacing))
+
+    def _refuse_tilting(self) -> None:
+        """Refuse a component that clamped points alone hold, on one line (in space: in one plane)."""
+        held = [self._holds(edge) for edge in (*self.edges, *self.sliding)]
+        alone = ~np.any(held, axis=0) if held else np.ones(len(self.grid.shape), dtype=bool)
+        if not alone.any():
+            return
+        low, high = _extent(self.grid)
+        motions = np.column_stack([np.ones(len(self.points)), (self.points - low) / (high - low).max()])
+        if np.linalg.matrix_rank(motions, tol=1e-6) == motions.shape[1]:
+            return
+        D, axis = len(low), int(np.flatnonzero(alone)[0])
+        edges = [name for name, (d, _) in SIDES.items() if d == axis]
+        raise InputError(
+            f"no edge holds the {'xyz'[axis]} direction, and {len(self.points)} clamped "
+            f"point{'s'[: len(self.points) != 1]} on one {'line' if D == 2 else 'plane'} do not determine a thin plate there: "
+            f"let the {edges[0]} or {edges[1]} edge slide, clamp an edge, clamp more points, or use the elastic kernel"
+        )
 
 
 def contact_lattice(clamps: Clamps, spacing: float) -> NDArray[np.intp]:
@@ -214,7 +314,7 @@ def contact_lattice(clamps: Clamps, spacing: float) -> NDArray[np.intp]:
     Parameters
     ----------
     clamps : Clamps
-        Clamped nodes are left out.
+        Nodes of which any component is held are left out.
     spacing : float
         mm; 0 takes every node, as the paper does.
 
@@ -228,7 +328,8 @@ def contact_lattice(clamps: Clamps, spacing: float) -> NDArray[np.intp]:
         stride = max(1, round(spacing / h))
         lines.append(np.arange((n - 1) % stride // 2, n, stride, dtype=np.intp))
     lattice = _indices(grid)[np.ix_(*lines[::-1])].ravel()
-    return np.setdiff1d(lattice, clamps.nodes)
+    free: NDArray[np.intp] = lattice[~clamps.held[lattice].any(axis=1)]
+    return free
 
 
 def join_gap(grid: Mesh, lattice: NDArray[np.intp]) -> float:

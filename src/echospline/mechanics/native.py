@@ -98,7 +98,7 @@ class NativeStep:
     grid : RegularGrid
         The mesh.
     clamps : Clamps
-        The clamped edges and points.
+        The clamped and sliding edges, and clamped points.
     parameters : TPSParameters
         Of the interaction.
     kernel : Kernel
@@ -287,12 +287,13 @@ def _options(
     o = core.SceneOptions(struct_size=ctypes.sizeof(core.SceneOptions), dimension=2)
     o.precision = core.Precision.SINGLE if precision == "single" else core.Precision.DOUBLE
     o.tip = core.Tip.TIP_NODE if p.tip == "node" else core.Tip.TIP_POINT
-    o.loading = core.Loading.IMMEDIATE if p.loading == "immediate" else core.Loading.FOLLOW
+    o.loading = core.Loading[p.loading.upper()]
     o.clamped = int(sum(core.Edge[edge.upper()] for edge in set(clamps.edges)))
+    o.sliding = int(sum(core.Edge[edge.upper()] for edge in set(clamps.sliding)))
     for d in (0, 1):
         o.shape[d], o.spacing[d], o.origin[d] = grid.shape[d], grid.spacing[d], grid.origin[d]
     o.sigma, o.delta, o.alpha1, o.alpha2, o.alpha3 = p.sigma, p.delta, p.alpha1, p.alpha2, p.alpha3
-    o.length, o.drag = p.length, p.drag
+    o.length, o.drag, o.friction_speed = p.length, p.drag, p.friction_speed
     o.contact_spacing, o.anchor_spacing = p.contact_spacing, p.anchor_spacing
     elastic = kernel if isinstance(kernel, Elastic) else Elastic()
     o.kernel = core.Kernel.ELASTIC if elastic is kernel else core.Kernel.THIN_PLATE

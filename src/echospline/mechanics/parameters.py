@@ -29,8 +29,11 @@ class TPSParameters:
         Share of the shaft's sideways motion that contacts follow, 0 (the paper) to 1 (bonded).
     tip : {"point", "node"}
         A landmark at the tip itself, or the nearest mesh node as printed (which jumps).
-    loading : {"follow", "immediate"}
-        Friction grows no faster than the needle moves, or is there at once as printed.
+    loading : {"stick", "follow", "immediate"}
+        Tissue sticks to the shaft and slips beyond what friction holds; or follows friction at the present speed,
+        no faster than the needle moves, and relaxes at rest; or is there at once, as printed.
+    friction_speed : float
+        Speed at which equation (15) says how far friction holds tissue that sticks, mm/s.
     contact_spacing : float
         Distance between the nodes that may become contacts, mm; 0 takes every mesh node, as printed.
     anchor_spacing : float
@@ -45,7 +48,8 @@ class TPSParameters:
     length: float = 1.0
     drag: float = 1.0
     tip: Literal["point", "node"] = "point"
-    loading: Literal["follow", "immediate"] = "follow"
+    loading: Literal["stick", "follow", "immediate"] = "stick"
+    friction_speed: float = 10.0
     contact_spacing: float = 1.25
     anchor_spacing: float = 1.5
 
@@ -58,6 +62,7 @@ class TPSParameters:
             "alpha3": (0.0, inf, "1/s"),
             "length": (1e-9, inf, "mm"),
             "drag": (0.0, 1.0, "(no unit)"),
+            "friction_speed": (0.0, inf, "mm/s"),
             "contact_spacing": (0.0, inf, "mm"),
             "anchor_spacing": (1e-3, inf, "mm"),
         }
@@ -69,5 +74,5 @@ class TPSParameters:
                 )
         if self.tip not in ("point", "node"):
             raise InputError(f'tip is "point" or "node"; got {self.tip!r}')
-        if self.loading not in ("follow", "immediate"):
-            raise InputError(f'loading is "follow" or "immediate"; got {self.loading!r}')
+        if self.loading not in ("stick", "follow", "immediate"):
+            raise InputError(f'loading is "stick", "follow" or "immediate"; got {self.loading!r}')

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 from numpy.typing import ArrayLike
 
+from echospline.mechanics.forces import NeedleLoad
 from echospline.scene import Floats, NeedlePose, RegularGrid, SpatialGrid, SpatialPose
+
+__all__ = ["LoadedModel", "NeedleLoad", "State", "TissueModel", "needle_load"]
 
 State = TypeVar("State")
 
@@ -39,6 +42,20 @@ class TissueModel(Protocol, Generic[State]):
     def displacement_at(self, state: State, points: ArrayLike) -> Floats:
         """Displacement of any reference points (n, 2) in mm, shape (n, 2), mm."""
         ...
+
+
+@runtime_checkable
+class LoadedModel(Protocol):
+    """A tissue model that knows the needle's forces."""
+
+    def needle_load(self, state: Any) -> NeedleLoad:
+        """Return the needle's forces on the tissue in a state."""
+        ...
+
+
+def needle_load(model: object, state: object) -> NeedleLoad | None:
+    """Return the needle's forces in a state of any model; None where the model has none (landmarks)."""
+    return model.needle_load(state) if isinstance(model, LoadedModel) else None
 
 
 class SpatialTissueModel(Protocol, Generic[State]):

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from math import expm1, inf, isfinite
+from math import ceil, expm1, inf, isfinite
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,6 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from echospline.mechanics.interaction import (
     CALM,
     LET_GO,
+    MOST_SUBSTEPS,
+    SUBSTEP,
     Pose,
     approach,
     friction,
@@ -18,15 +21,20 @@ from echospline.mechanics.interaction import (
     load,
     needle_travel,
     relax,
+    stick,
     tip_push,
+    yielding,
 )
 from echospline.mechanics.kernels import Kernel
-from echospline.mechanics.landmarks import Clamps, Mesh
+from echospline.mechanics.landmarks import Anchors, Clamps, Mesh
 from echospline.mechanics.parameters import TPSParameters
 from echospline.mechanics.spline import Spline, factor
 from echospline.scene import ZERO_LENGTH, Floats
 
 Nodes = NDArray[np.intp]
+
+SAME_PLACE = 1e-6
+"""mm; a tip closer than this to a contact replaces it as landmark, and one so close to what is clamped pushes nothing."""
 
 
 @dataclass(frozen=True)
@@ -102,9 +110,9 @@ class Reference:
     kernel : Kernel
         `ThinPlate` (the paper) or `Elastic`, of the mesh's dimension.
     clamps : Clamps
-        The clamped edges (faces) and points.
-    anchors : ndarray, shape (a, D)
-        Landmarks along them that stay, mm.
+        The clamped and sliding edges (faces), and clamped points.
+    anchors : Anchors
+        Landmarks along them that stay.
     lattice : ndarray of int, shape (K,)
         Mesh nodes that may become contacts.
     gap : float
@@ -119,51 +127,112 @@ class Reference:
         parameters: TPSParameters,
         kernel: Kernel,
         clamps: Clamps,
-        anchors: Floats,
+        anchors: Anchors,
         lattice: Nodes,
         gap: float,
         stiffness: Floats | None,
     ) -> None:
         self.grid, self.parameters, self.kernel, self.clamps = grid, parameters, kernel, clamps
         self.anchors, self.lattice, self.gap, self.stiffness = anchors, lattice, gap, stiffness
+        # of the nodes that may become contacts, from what is clamped: beside a sliding edge tissue can follow
+        none = np.zeros(len(grid.shape))
+        self.clearance = np.array([clamps.clearance(node, none) for node in grid.nodes[lattice]])
 
     def advance(self, state: TPSState, pose: Pose, dt: float) -> TPSState:
-        """State after the needle has moved to ``pose`` in ``dt`` seconds, Algorithm 2."""
+        """State after the needle has moved to ``pose`` in ``dt`` seconds, Algorithm 2.
+
+        A needle that moves far in one step does so in substeps, so that what it touches and leaves does not depend
+        on the time step. Only the printed loading, which moves everything at once, takes a step as one.
+        """
+        before = _at(pose.entry, pose.entry) if state.pose is None else state.pose
+        parts = 1
+        if self.parameters.loading != "immediate":
+            parts = max(1, min(MOST_SUBSTEPS, ceil(needle_travel(before, pose) / SUBSTEP - 1e-9)))
+        held_back = state.held_back
+        for part in range(1, parts + 1):
+            there = pose if part == parts else _between(before, pose, part / parts)
+            state = self._substep(state, there, dt / parts)
+        return replace(state, held_back=held_back + (state.held_back > held_back))
+
+    def _substep(self, old: TPSState, pose: Pose, dt: float) -> TPSState:
         p = self.parameters
-        axis = np.array(pose.axis)
         immediate = p.loading == "immediate"
-        way = pose.depth if state.pose is None else needle_travel(state.pose, pose)
-        travel = inf if immediate else way
-
-        old = state
+        before = _at(pose.entry, pose.entry) if old.pose is None else old.pose
+        travel = inf if immediate else needle_travel(before, pose)
         state = self._touch(old, pose, leave_at_once=immediate)
-        nodes = self.grid.nodes[state.contacts]
-        q = state.q.copy()
-        on = state.touching
-        distance = self._distance(nodes[on], q[on], pose)[1]
-        shaft = np.asarray(pose.entry) + state.along[on, None] * axis
-        side = _across(state.grip[on] + p.drag * shaft, axis)
-        f = friction(distance, pose.speed, p.alpha1, p.alpha2, p.length)
-        q[on] = load(q[on], f, side, axis, p.alpha3, dt, travel)
+        on, off = state.touching, ~state.touching
+        while_touched, since_left = self._ways(old, state, pose, before, travel)
 
-        tip = self._tip(old, state, q, pose, dt, travel)
-        off = ~on
+        handled = on | (while_touched > 0)  # one that has just left was dragged until then
+        q = state.q.copy()
+        q[handled] = self._handled(state, handled, pose, before, dt, while_touched)
+        tip = self._tip(old, state, q, pose, before, dt, travel)
         free = np.zeros_like(q[off])
         if off.any():
             without = self._fit(state.contacts[on], q[on], tip)
-            free = free if without is None else without(nodes[off])
-            q[off] = approach(relax(q[off], free, p.alpha3, dt), free, travel)
+            free = free if without is None else without(self.grid.nodes[state.contacts[off]])
+            if tip is not None:  # a contact that the tip replaces goes with it
+                free[self._on_tip(state.contacts[off], tip)] = tip.q
+            q[off] = self._returned(q[off], free, dt, since_left[off], travel)
+
         displaced = state.q if old.tip is None else np.vstack([state.q, old.tip.q])
         relaxed = float(_lengths(displaced).max(initial=0.0)) * -expm1(-p.alpha3 * dt)
-        state, tip = self._hold_back(old, state, q, tip, CALM * (travel + relaxed) + LET_GO)
+        limit = CALM * (travel + relaxed) + LET_GO
+        state, tip = self._hold_back(old, state, q, tip, limit, dt)
+        return self._release(replace(state, pose=pose, tip=tip), off, free)
 
-        keep = np.ones(len(state.q), dtype=bool)
-        keep[off] = _lengths(state.q[off] - free) > LET_GO
-        if not keep.all():
-            state = _select(state, keep)
-            state = replace(state, field=self._fit(state.contacts, state.q, tip))
-            state = replace(state, lattice=self._on_lattice(state.field))
-        return replace(state, pose=pose, tip=tip)
+    def _ways(
+        self, old: TPSState, new: TPSState, pose: Pose, before: Pose, travel: float
+    ) -> tuple[Floats, Floats]:
+        """How far the needle moved while it touched each contact, and since it left it, mm, shape (k,) each.
+
+        The tip has passed a contact that joins, and drawn back from one that leaves, somewhere within the step.
+        """
+        while_touched = np.where(new.touching, travel, 0.0)
+        since_left = np.where(new.touching, 0.0, travel)
+        if isfinite(travel):
+            touched = np.isin(new.contacts, old.contacts[old.touching])
+            out = pose.depth < ZERO_LENGTH
+            axis = np.array(before.axis if out else pose.axis)
+            passed = pose.depth - self.gap - (self.grid.nodes[new.contacts] - pose.entry) @ axis
+            fresh, left = new.touching & ~touched, ~new.touching & touched
+            while_touched[fresh] = np.clip(passed[fresh], 0.0, travel)
+            drawn_back = left & ((passed < 0) | out)
+            since_left[drawn_back] = np.clip(-passed[drawn_back], 0.0, travel)
+            while_touched[left] = travel - since_left[left]
+        return while_touched, since_left
+
+    def _handled(
+        self,
+        state: TPSState,
+        which: NDArray[np.bool_],
+        pose: Pose,
+        before: Pose,
+        dt: float,
+        travel: Floats,
+    ) -> Floats:
+        """Return new displacements of contacts that the needle touches, or touched in this step; (13) to (16)."""
+        p, axis, travel = self.parameters, np.array(pose.axis), travel[which]
+        q, nodes = state.q[which], self.grid.nodes[state.contacts[which]]
+        distance = self._distance(nodes, q, pose)[1]
+        shaft = np.asarray(pose.entry) + state.along[which, None] * axis
+        side = _across(state.grip[which] + p.drag * shaft, axis)
+        sticks = p.loading == "stick"
+        f = friction(distance, p.friction_speed if sticks else pose.speed, p.alpha1, p.alpha2, p.length)
+        if p.loading != "immediate":
+            f = yielding(f, self.clearance[np.searchsorted(self.lattice, state.contacts[which])])
+        # a shaft that hardly is in the tissue drags it no further than its own depth
+        most = inf if p.loading == "immediate" else pose.depth
+        if not sticks:
+            return load(q, f, side, axis, p.alpha3, dt, travel, most)
+        moved = np.clip(float(np.subtract(pose.tip, before.tip) @ axis), -travel, travel)
+        return stick(q, np.minimum(np.abs(f), most), moved, side, axis, travel)
+
+    def _returned(self, q: Floats, free: Floats, dt: float, since: Floats, travel: float) -> Floats:
+        """Return displacements of contacts that the needle has left, on their way to the field without them."""
+        share = since / travel if 0.0 < travel < inf else np.ones_like(since)
+        left_over = np.exp(-self.parameters.alpha3 * dt * share)[:, None]
+        return approach(free + (q - free) * left_over, free, since)
 
     def rest(self) -> TPSState:
         """State of tissue that no needle has touched."""
@@ -180,13 +249,20 @@ class Reference:
         return self._fit(state.contacts, state.q, state.tip)
 
     def _hold_back(
-        self, old: TPSState, new: TPSState, q: Floats, tip: Tip | None, limit: float
+        self,
+        old: TPSState,
+        new: TPSState,
+        q: Floats,
+        tip: Tip | None,
+        limit: float,
+        dt: float,
     ) -> tuple[TPSState, Tip | None]:
         """Move the landmarks to their new displacements, or as far that way as no node moves beyond the limit.
 
         A few landmarks close together can swing the field far from them much further than they move themselves.
         Landmarks that stay at the displacement which the field already has change nothing, and the field is
-        linear in their displacements, so the largest share that keeps the limit is found at once.
+        linear in their displacements, so the largest share that keeps the limit is found at once. Only a tip that moves on
+        takes a landmark away where it was; where that alone is too much, it leaves its landmark there.
         """
         was = self._at_lattice(old)
         field = self._fit(new.contacts, q, tip)
@@ -195,6 +271,11 @@ class Reference:
             return replace(new, q=q, field=field, lattice=u), tip
         stay = None if tip is None else replace(tip, q=self.displacement_at(old, tip.point[None])[0])
         rest = _zero(self._on_lattice(self._fit(new.contacts, new.q, stay)), was) - was
+        if old.tip is not None and _lengths(rest).max(initial=0.0) > limit:
+            tip = self._leaving_tip(old.tip, new, q, dt, limit / CALM, drop=False)
+            stay = old.tip
+            u = self._on_lattice(self._fit(new.contacts, q, tip))
+            rest = np.zeros_like(rest)
         share = largest_share(rest, _zero(u, was) - was, limit)
         q = new.q + share * (q - new.q)
         if tip is not None and stay is not None:
@@ -203,6 +284,32 @@ class Reference:
         return replace(
             new, q=q, field=field, lattice=self._on_lattice(field), held_back=old.held_back + 1
         ), tip
+
+    def _release(self, state: TPSState, off: NDArray[np.bool_], free: Floats) -> TPSState:
+        """Drop contacts that the needle has left and that no longer matter: the field without each one is the same.
+
+        One that has come to where it goes may still hold back others that have not; so each is judged by the field without
+        it alone, and all that go in one step change the field by no more than one may.
+        """
+        close = np.zeros(len(state.q), dtype=bool)
+        close[off] = _lengths(state.q[off] - free) <= LET_GO
+        keep, changed = np.ones(len(state.q), dtype=bool), 0.0
+        for j in np.flatnonzero(close):
+            keep[j] = False
+            if state.tip is not None and self._on_tip(state.contacts[j : j + 1], state.tip)[0]:
+                without = state.tip.q
+            else:
+                rest = self._fit(state.contacts[keep], state.q[keep], state.tip)
+                node = self.grid.nodes[state.contacts[j]]
+                without = np.zeros_like(node) if rest is None else rest(node)[0]
+            change = float(_lengths(state.q[j] - without))
+            keep[j] = changed + change > LET_GO
+            changed += 0.0 if keep[j] else change
+        if keep.all():
+            return state
+        state = _select(state, keep)
+        field = self._fit(state.contacts, state.q, state.tip)
+        return replace(state, field=field, lattice=self._on_lattice(field))
 
     @property
     def _dimension(self) -> int:
@@ -259,24 +366,66 @@ class Reference:
         )
 
     def _tip(
-        self, old: TPSState, new: TPSState, q: Floats, pose: Pose, dt: float, travel: float
+        self, old: TPSState, new: TPSState, q: Floats, pose: Pose, before: Pose, dt: float, travel: float
     ) -> Tip | None:
         """Return the tip's landmark, equation (12); None where the tip pushes nothing."""
         p, axis, point = self.parameters, np.array(pose.axis), np.asarray(pose.tip)
-        clearance = self.clamps.clearance(pose.tip)
-        if clearance <= 0.0 or p.sigma == 0.0:
+        clearance = self.clamps.clearance(pose.tip, axis)
+        if p.sigma == 0.0 or (clearance <= 0.0 and (p.loading == "immediate" or p.tip == "node")):
             return None
-        push = tip_push(pose, p.sigma, clearance) * axis
+        push = self._push(pose, clearance) * axis
         advancing = pose.speed >= 0 and pose.depth >= ZERO_LENGTH
         if p.tip == "node":
             node = self.grid.nearest(pose.tip)
-            if not advancing or node in self.clamps.nodes:
+            if not advancing or self.clamps.held[node].any():
                 return None
             place = self.grid.nodes[node]
             return Tip(place, point + push - place)
         if p.loading == "immediate":
             return Tip(point, push) if advancing else None
-        return self._following_tip(old, new, q, pose, push if advancing else None, dt, travel)
+        if p.loading == "stick":
+            return self._sticking_tip(old, new, q, pose, before, dt, travel)
+        inside = advancing and clearance > SAME_PLACE
+        return self._following_tip(old, new, q, pose, push if inside else None, dt, travel)
+
+    def _push(self, pose: Pose, clearance: float) -> float:
+        """How far the tip pushes the tissue ahead of it, mm; beside what is clamped it fades as friction does, or as printed."""
+        p = self.parameters
+        if p.loading == "immediate":
+            return tip_push(pose, p.sigma, clearance)
+        return float(yielding(np.array([min(p.sigma, pose.depth)]), np.array([clearance]))[0])
+
+    def _sticking_tip(
+        self, old: TPSState, new: TPSState, q: Floats, pose: Pose, before: Pose, dt: float, travel: float
+    ) -> Tip | None:
+        """Return the tip's landmark where it pushes and never pulls: a stop with one side, whatever the speed.
+
+        The landmark moves on with a tip that advances, pushed ahead by up to sigma. A tip that draws back lets the tissue
+        there come back by as much, until the landmark does nothing and is gone; one that returns before that takes it up.
+        """
+        axis, point, tip = np.array(pose.axis), np.asarray(pose.tip), old.tip
+        moved = float((point - before.tip) @ axis)
+        lead = 0.0
+        if tip is not None and tip.pushed:
+            lead = max(0.0, float((tip.point - before.tip) @ np.array(before.axis)) - moved)
+        elif tip is not None and (moved <= 0 or _lengths(point - tip.point) > max(travel, LET_GO)):
+            return self._leaving_tip(tip, new, q, dt, travel)
+        place = point + lead * axis
+        clearance = self.clamps.clearance(place.tolist(), axis)
+        if pose.depth < ZERO_LENGTH or clearance <= SAME_PLACE:
+            return None if tip is None else self._leaving_tip(tip, new, q, dt, travel)
+        clear = _lengths(self.grid.nodes[new.contacts[~new.touching]] - place).min(initial=inf) > self.gap
+        if tip is None and (moved <= 0 or not clear):
+            return None
+        field = self._fit(new.contacts, q)
+        free = np.zeros_like(point) if field is None else field(place)[0]
+        was = self.displacement_at(old, place[None])[0] if tip is None else tip.q
+        push = self._push(pose, clearance)
+        ahead = max(min(float(was @ axis) + moved, push), float(free @ axis))
+        pushed = approach(was[None], (ahead * axis + _across(free, axis))[None], travel)[0]
+        if moved <= 0 and _lengths(pushed - free) <= LET_GO:
+            return None
+        return Tip(place, pushed)
 
     def _following_tip(
         self,
@@ -311,11 +460,13 @@ class Reference:
         wanted = ahead * axis + _across(free, axis)
         return Tip(point, approach(was[None], wanted[None], travel)[0])
 
-    def _leaving_tip(self, tip: Tip, new: TPSState, q: Floats, dt: float, travel: float) -> Tip | None:
+    def _leaving_tip(
+        self, tip: Tip, new: TPSState, q: Floats, dt: float, travel: float, *, drop: bool = True
+    ) -> Tip | None:
         """Let the landmark that the tip has left relax to the field without it, then go."""
         field = self._fit(new.contacts, q)
         free = np.zeros_like(tip.q) if field is None else field(tip.point)[0]
-        if _lengths(tip.q - free) <= LET_GO:
+        if drop and _lengths(tip.q - free) <= LET_GO:
             return None
         relaxed = relax(tip.q, free, self.parameters.alpha3, dt)
         return Tip(tip.point, approach(relaxed[None], free[None], travel)[0], pushed=False)
@@ -324,16 +475,23 @@ class Reference:
         """Spline through anchors, contacts and tip; None where there is nothing but anchors."""
         if tip is None and len(contacts) == 0:
             return None
-        landmarks = [self.anchors, self.grid.nodes[contacts]]
-        moves = [np.zeros_like(self.anchors), q]
+        anchors = self.anchors.places
+        landmarks = [anchors, self.grid.nodes[contacts]]
+        moves = [np.zeros_like(anchors), q]
         if tip is not None:
-            apart = _lengths(landmarks[1] - tip.point) > 1e-6  # a tip on a node speaks for it
+            apart = ~self._on_tip(contacts, tip)
             contacts = contacts[apart]
-            landmarks = [self.anchors, landmarks[1][apart], tip.point[None]]
+            landmarks = [anchors, landmarks[1][apart], tip.point[None]]
             moves = [moves[0], q[apart], tip.q[None]]
-        return factor(self.kernel, np.vstack(landmarks), self._stiffness(contacts, tip)).solve(
-            np.vstack(moves)
-        )
+        every = np.vstack(landmarks)
+        held = np.ones(every.shape, dtype=bool)
+        held[: len(anchors)] = self.anchors.held
+        return factor(self.kernel, every, self._stiffness(contacts, tip), held).solve(np.vstack(moves))
+
+    def _on_tip(self, contacts: Nodes, tip: Tip) -> NDArray[np.bool_]:
+        """Which contacts the tip replaces as landmark, being in the same place."""
+        there: NDArray[np.bool_] = _lengths(self.grid.nodes[contacts] - tip.point) <= SAME_PLACE
+        return there
 
     def _stiffness(self, contacts: Nodes, tip: Tip | None) -> Floats | None:
         """Return the stiffness of anchors (infinite), contacts and tip."""
@@ -343,6 +501,38 @@ class Reference:
         if tip is not None:
             own.append(self.stiffness[[self.grid.nearest(tip.point)]])
         return np.concatenate(own)
+
+
+@dataclass(frozen=True)
+class _Between:
+    """A pose within a step."""
+
+    entry: tuple[float, ...]
+    tip: tuple[float, ...]
+    speed: float
+
+    @property
+    def depth(self) -> float:
+        return float(np.linalg.norm(np.subtract(self.tip, self.entry)))
+
+    @property
+    def axis(self) -> tuple[float, ...]:
+        length = self.depth
+        share = 1.0 / length if length >= ZERO_LENGTH else 0.0
+        return tuple(share * np.subtract(self.tip, self.entry))
+
+
+def _at(entry: Sequence[float], tip: Sequence[float], speed: float = 0.0) -> Pose:
+    return _Between(tuple(entry), tuple(tip), speed)
+
+
+def _between(before: Pose, after: Pose, share: float) -> Pose:
+    """Pose on the straight way of both ends of the needle, at the speed of the whole step."""
+    entry, tip = (
+        np.add(a, share * np.subtract(b, a))
+        for a, b in ((before.entry, after.entry), (before.tip, after.tip))
+    )
+    return _at(entry.tolist(), tip.tolist(), after.speed)
 
 
 def _lengths(vectors: Floats) -> Floats:

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import lu_factor, lu_solve
 from scipy.spatial import cKDTree
 
 from echospline.errors import InputError, SolverError
-from echospline.mechanics.kernels import Kernel
+from echospline.mechanics.kernels import Apart, Kernel
 from echospline.scene import Floats, as_points
 
 RESIDUAL = 1e-7
@@ -80,7 +80,10 @@ class Spline:
 
 @dataclass(frozen=True)
 class FactoredSpline:
-    """The factors of L (6) for one set of landmarks; `solve` costs two triangular solves."""
+    """The factors of L (6) for one set of landmarks; `solve` costs two triangular solves.
+
+    ``kept`` are the rows of the unknowns (weights, then motions) that the system has: all, unless a landmark leaves a component free.
+    """
 
     kernel: Kernel
     landmarks: Floats
@@ -88,6 +91,7 @@ class FactoredSpline:
     scale: float
     system: Floats
     factors: Any
+    kept: NDArray[np.bool_]
 
     def solve(self, displacements: ArrayLike) -> Spline:
         """Fit displacements at the landmarks, equations (7) and (8).
@@ -95,7 +99,7 @@ class FactoredSpline:
         Parameters
         ----------
         displacements : array_like, shape (m, D)
-            Target minus source of each landmark, mm.
+            Target minus source of each landmark, mm; a component that the landmark leaves free is not read.
 
         Returns
         -------
@@ -114,9 +118,10 @@ class FactoredSpline:
             raise InputError(
                 f"one displacement per landmark is needed: {m} landmarks, {len(d)} displacements"
             )
-        V = np.vstack([_as_blocks(d, c), np.zeros((len(self.system) - m * c, D // c))])
-        solution = lu_solve(self.factors, V, check_finite=False)
-        misfit = float(np.abs(self.system @ solution - V).max())
+        V = np.vstack([_as_blocks(d, c), np.zeros((len(self.kept) - m * c, D // c))])
+        solution, asked = np.zeros_like(V), V[self.kept]
+        solution[self.kept] = lu_solve(self.factors, asked, check_finite=False)
+        misfit = float(np.abs(self.system @ solution[self.kept] - asked).max())
         if not misfit <= RESIDUAL * max(1.0, float(np.abs(d).max())):
             raise SolverError(
                 f"the spline misses its landmarks by {misfit:.1e} mm: two of the {m} landmarks lie too close "
@@ -127,7 +132,12 @@ class FactoredSpline:
         )
 
 
-def factor(kernel: Kernel, landmarks: ArrayLike, stiffness: ArrayLike | None = None) -> FactoredSpline:
+def factor(
+    kernel: Kernel,
+    landmarks: ArrayLike,
+    stiffness: ArrayLike | None = None,
+    held: NDArray[np.bool_] | None = None,
+) -> FactoredSpline:
     """Assemble and factor L, equation (6).
 
     Parameters
@@ -140,6 +150,9 @@ def factor(kernel: Kernel, landmarks: ArrayLike, stiffness: ArrayLike | None = N
         How firmly each landmark holds its displacement (Rohr et al. 2001): the spline minimises
         sum k |d - u|^2 + energy. Infinite (the default) interpolates. Thin plate: 1/mm^2 (1/mm in space), beside the
         bending energy (1). Elastic: relative to the shear modulus (mm in space).
+    held : ndarray of bool, shape (m, D), optional
+        Which components of its displacement each landmark determines; all when not given. One that it leaves free takes no
+        force there: the spline slides over it.
 
     Returns
     -------
@@ -151,7 +164,8 @@ def factor(kernel: Kernel, landmarks: ArrayLike, stiffness: ArrayLike | None = N
         If landmarks are too few, on one line (in space: in one plane), coincident or not finite, or a stiffness is not
         positive.
     """
-    points, x, centre, scale = condition(kernel, landmarks)
+    kernel, held = _apart(kernel, held)
+    points, x, centre, scale = condition(kernel, landmarks, held)
     m, c = len(points), kernel.components
     conditioned = kernel.scaled(scale)
     K = conditioned.matrix(x, x)
@@ -163,10 +177,16 @@ def factor(kernel: Kernel, landmarks: ArrayLike, stiffness: ArrayLike | None = N
         K = K + np.diag(np.tile(compliance(kernel, k) / scale**kernel.length_power, c))
     p = R.shape[1]
     L = np.block([[K, R], [R.T, np.zeros((p, p))]])
-    return FactoredSpline(conditioned, points, centre, scale, L, lu_factor(L, check_finite=False))
+    kept = np.ones(len(L), dtype=bool)
+    if held is not None:
+        kept[: m * c] = held.T.ravel()
+        L = L[np.ix_(kept, kept)]
+    return FactoredSpline(conditioned, points, centre, scale, L, lu_factor(L, check_finite=False), kept)
 
 
-def condition(kernel: Kernel, landmarks: ArrayLike) -> tuple[Floats, Floats, Floats, float]:
+def condition(
+    kernel: Kernel, landmarks: ArrayLike, held: NDArray[np.bool_] | None = None
+) -> tuple[Floats, Floats, Floats, float]:
     """Check landmarks, and shift and scale them for a solve.
 
     Parameters
@@ -175,6 +195,8 @@ def condition(kernel: Kernel, landmarks: ArrayLike) -> tuple[Floats, Floats, Flo
         `ThinPlate` or `Elastic`.
     landmarks : array_like, shape (m, D)
         mm.
+    held : ndarray of bool, shape (m, D), optional
+        As in `factor`.
 
     Returns
     -------
@@ -190,6 +212,7 @@ def condition(kernel: Kernel, landmarks: ArrayLike) -> tuple[Floats, Floats, Flo
     InputError
         If landmarks are too few, on one line (in space: in one plane), coincident or not finite.
     """
+    kernel, held = _apart(kernel, held)
     D, c = kernel.dimension, kernel.components
     points = as_points(landmarks, "landmarks", D)
     m = len(points)
@@ -201,8 +224,13 @@ def condition(kernel: Kernel, landmarks: ArrayLike) -> tuple[Floats, Floats, Flo
     centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
     scale = float(np.ptp(points, axis=0).max()) / 2 or 1.0
     x = (points - centre) / scale
-    _refuse_degenerate(kernel, points, x)
+    _refuse_degenerate(kernel, points, x, held)
     return points, x, centre, scale
+
+
+def _apart(kernel: Kernel, held: NDArray[np.bool_] | None) -> tuple[Kernel, NDArray[np.bool_] | None]:
+    """Return the kernel with D components, and what is held, where some landmark leaves a component free; else None for that."""
+    return (kernel, None) if held is None or held.all() else (kernel.apart(), held)
 
 
 def compliance(kernel: Kernel, stiffness: Floats) -> Floats:
@@ -215,16 +243,21 @@ def compliance(kernel: Kernel, stiffness: Floats) -> Floats:
     return added
 
 
-def _refuse_degenerate(kernel: Kernel, points: Floats, x: Floats) -> None:
+def _refuse_degenerate(kernel: Kernel, points: Floats, x: Floats, held: NDArray[np.bool_] | None) -> None:
     pairs = cKDTree(x).query_pairs(1e-9)
     if pairs:
         i, j = min(pairs)
         raise InputError(
             f"landmarks {i} and {j} coincide at ({', '.join(f'{x:g}' for x in points[i])}) mm; keep one of them"
         )
-    singular = np.linalg.svd(kernel.polynomial(x), compute_uv=False)
-    if singular[-1] < 1e-9 * singular[0]:
-        flat = "in one plane" if kernel.dimension == 3 and kernel.components == 1 else "on one line"
+    motions = kernel.polynomial(x)
+    if held is not None:
+        motions = motions[held.T.ravel()]
+    singular = np.linalg.svd(motions, compute_uv=False)
+    if len(singular) < motions.shape[1] or singular[-1] < 1e-9 * singular[0]:
+        plate = kernel.components == 1 or isinstance(kernel, Apart)
+        flat = "in one plane" if kernel.dimension == 3 and plate else "on one line"
+        flat = flat if held is None else f"{flat} in some direction"
         raise InputError(
             f"the {len(points)} landmarks lie {flat}, so a spline is not determined; add one beside it"
         )

@@ -9,24 +9,47 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import partial
-from math import isfinite
 from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from echospline.errors import InputError
-from echospline.mechanics.kernels import Kernel, ThinPlate
-from echospline.mechanics.landmarks import Clamps, contact_lattice, join_gap
+from echospline.mechanics.kernels import Elastic, Kernel, ThinPlate
+from echospline.mechanics.landmarks import Anchors, Clamps, contact_lattice, join_gap
 from echospline.mechanics.native import NativeState, NativeStep, Precision
 from echospline.mechanics.parameters import TPSParameters
 from echospline.mechanics.reference import Reference, TPSState
 from echospline.mechanics.spline import Spline, condition
-from echospline.scene import Floats, NeedlePose, RegularGrid
+from echospline.scene import Floats, NeedlePose, RegularGrid, is_number
 
 Solver = Literal["response", "refit"]
 
 State = TPSState | NativeState
+
+
+def anchors_for(clamps: Clamps, kernel: Kernel, spacing: float) -> Anchors:
+    """Anchors that determine a spline of this kernel.
+
+    Parameters
+    ----------
+    clamps : Clamps
+        What holds the tissue.
+    kernel : Kernel
+        `ThinPlate`, whose slope has to be held, too, where a component is held along one edge alone, or `Elastic`.
+    spacing : float
+        Greatest distance between anchors along an edge, mm.
+
+    Raises
+    ------
+    InputError
+        If there are too many, or they leave a component free.
+    """
+    anchors = clamps.anchors(spacing, affine=not isinstance(kernel, Elastic))
+    condition(
+        kernel, anchors.places, anchors.held
+    )  # refuses anchors that hold nothing, before any step is made
+    return anchors
 
 
 class TPSModel:
@@ -37,11 +60,13 @@ class TPSModel:
     grid : RegularGrid
         The mesh, 2 x 2 nodes or more.
     clamped : iterable of {"top", "bottom", "left", "right"}
-        Edges that anchors hold: the same that finite elements clamp.
+        Edges that anchors hold in every direction: the same that finite elements clamp.
     parameters : TPSParameters
         Of the interaction.
     kernel : Kernel
         `ThinPlate` (the paper) or `Elastic`.
+    sliding : iterable of the same names
+        Edges whose anchors hold the normal component alone: tissue slides along them.
     clamped_points : array_like, shape (k, 2), optional
         Further anchors, mm.
     stiffness : array_like, shape (n,), optional
@@ -66,6 +91,7 @@ class TPSModel:
         parameters: TPSParameters | None = None,
         kernel: Kernel | None = None,
         *,
+        sliding: Iterable[str] = (),
         clamped_points: ArrayLike | None = None,
         stiffness: ArrayLike | None = None,
         solver: Solver = "response",
@@ -80,9 +106,8 @@ class TPSModel:
         self.kernel = kernel or ThinPlate()
         if self.kernel.dimension != 2:
             raise InputError("a mesh in the plane takes a kernel of the plane; got one of dimension 3")
-        self.clamps = Clamps.of(grid, clamped, clamped_points)
-        self.anchors = self.clamps.anchors(self.parameters.anchor_spacing)
-        condition(self.kernel, self.anchors)  # refuses anchors that hold nothing, before any step is made
+        self.clamps = Clamps.of(grid, clamped, clamped_points, sliding)
+        self.anchors = anchors_for(self.clamps, self.kernel, self.parameters.anchor_spacing)
         self.lattice = contact_lattice(self.clamps, self.parameters.contact_spacing)
         self.gap = join_gap(grid, self.lattice)
         self.stiffness: Floats | None = None
@@ -112,6 +137,7 @@ class TPSModel:
         """Pickle what the model was made of; a copy has a workspace of its own."""
         made = partial(
             TPSModel,
+            sliding=self.clamps.sliding,
             clamped_points=self.clamps.points,
             stiffness=self.stiffness,
             solver=self.solver,
@@ -153,8 +179,8 @@ class TPSModel:
         InputError
             If dt is negative or not finite.
         """
-        if not (isfinite(dt) and dt >= 0):
-            raise InputError(f"dt must be zero or a positive number of seconds; got {dt}")
+        if not (is_number(dt) and dt >= 0):
+            raise InputError(f"dt must be zero or a positive number of seconds; got {dt!r}")
         if isinstance(state, NativeState):
             return self._native().advance(state, pose, dt)
         if self.native is not None:

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 from echospline.errors import InputError, ProtocolError
 
+PORT = 18944
+"""The port of OpenIGTLink."""
 HEADER_SIZE = 58
 VERSIONS = (1, 2, 3)
 """Header versions read: 1 (protocols 1 and 2) has no extended header, 2 (protocol 3) and later have one."""

@@ -8,15 +8,15 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-from echospline.errors import InputError
+from echospline.errors import InputError, ProtocolError
+from echospline.openigtlink.header import PORT
 from echospline.openigtlink.message import READABLE, Message, Request
 from echospline.openigtlink.peer import Key, Outgoing, Patience, Peer
 from echospline.openigtlink.text import NOT_FOUND, Capability, Status
+from echospline.openigtlink.tools import StartTracking
 
 log = logging.getLogger("echospline.openigtlink")
 
-PORT = 18944
-"""The port of OpenIGTLink."""
 QUESTIONS = (
     "GET_STATUS",
     "GET_CAPABIL",
@@ -56,6 +56,11 @@ class Link:
         Returns the answer to GET_STATUS.
     limits : LinkLimits
         Its limits.
+    on_request : frozenset of str
+        Types that a peer receives after STT_ alone; all others it receives until STP_.
+    asking : (Message, Message), optional
+        Sent to a server that the link connects to, when it is connected and when the link closes: the start and the end
+        of its stream.
     """
 
     def __init__(
@@ -63,6 +68,8 @@ class Link:
         received: Callable[[Peer, Message], None],
         status: Callable[[], Status] = Status,
         limits: LinkLimits | None = None,
+        on_request: frozenset[str] = frozenset(),
+        asking: tuple[Message, Message] | None = None,
     ) -> None:
         self._received, self._status = received, status
         self.limits = limits or LinkLimits()
@@ -73,6 +80,8 @@ class Link:
         self._servers: list[asyncio.Server] = []
         self._tasks: list[asyncio.Task[None]] = []
         self._closing = False
+        self._on_request, self._asking = on_request, asking
+        self._asked: list[Peer] = []
 
     async def serve(self, host: str = "127.0.0.1", port: int = PORT) -> int:
         """Listen for peers; returns the port (a free one for port 0).
@@ -108,8 +117,12 @@ class Link:
         outgoing = Outgoing(message)
         self._newest[outgoing.key] = outgoing
         for peer in list(self.peers):
-            if outgoing.key not in peer.sends:
+            if outgoing.key not in peer.sends and self._wanted(peer, outgoing):
                 peer.offer(outgoing)
+
+    def _wanted(self, peer: Peer, outgoing: Outgoing) -> bool:
+        kind = outgoing.message.type
+        return kind not in self._on_request or kind in peer.started
 
     async def close(self) -> None:
         """Close all connections."""
@@ -120,6 +133,8 @@ class Link:
         for server in self._servers:
             server.close()
         for peer in list(self.peers):
+            if self._asking is not None and peer in self._asked:
+                peer.answer(self._asking[1])
             peer.close("echospline is closing", politely=True)
         for _ in range(20):  # a peer that does not read cannot delay the end of the program
             if not self.peers:
@@ -148,7 +163,8 @@ class Link:
         for (
             outgoing
         ) in self._newest.values():  # a peer that joins late receives the newest messages, frozen or not
-            peer.offer(outgoing)
+            if self._wanted(peer, outgoing):
+                peer.offer(outgoing)
 
     def _leave(self, peer: Peer, reason: str) -> None:
         if peer in self.peers:
@@ -180,8 +196,12 @@ class Link:
                     complained = True
             else:
                 complained = False
+                if self._asking is not None:
+                    peer.answer(self._asking[0])
+                    self._asked.append(peer)
                 while peer in self.peers:
                     await asyncio.sleep(min(0.1, self.limits.retry))
+                self._asked = [one for one in self._asked if one is not peer]
             await asyncio.sleep(self.limits.retry)
 
     # ---- messages
@@ -200,7 +220,8 @@ class Link:
             peer.answer(replace(reply, content=self._status()))
         elif kind == "CAPABILITY":
             types = tuple(t.TYPE for t in READABLE)
-            peer.answer(replace(reply, content=Capability(types + QUESTIONS)))
+            streams = tuple(f"{word}_{t}" for t in sorted(self._on_request) for word in ("STT", "STP"))
+            peer.answer(replace(reply, content=Capability(types + QUESTIONS + streams)))
         elif prefix == "GET":
             found = [
                 o for (t, device), o in self._newest.items() if t == kind and message.device in ("", device)
@@ -210,8 +231,27 @@ class Link:
             if not found:
                 what = f"no {kind} of {message.device or 'any device'} is sent here"
                 peer.answer(replace(reply, content=Status(NOT_FOUND, 0, "NotFound", what)))
+        elif kind in self._on_request and prefix in ("STT", "STP"):
+            self._stream(peer, reply, request, kind)
         elif prefix in ("STT", "STP"):
             known = any(t == kind for t, _ in self._newest)
             (peer.muted.discard if prefix == "STT" else peer.muted.add)(kind)
             # the byte of RTS_ is 0 for yes and 1 for no
             peer.answer(replace(reply, content=Request(f"RTS_{name}"[:12], b"\0" if known else b"\1")))
+        elif prefix == "RTS" and request.body[:1] == b"\1":
+            log.warning("%s does not start its %s", peer.name, kind)
+
+    def _stream(self, peer: Peer, reply: Message, request: Request, kind: str) -> None:
+        """Start or end a stream of this type to a peer."""
+        done = True
+        if request.type.startswith("STP"):
+            peer.started.pop(kind, None)
+        else:
+            try:
+                start = StartTracking.unpack(request.body) if kind.endswith("DATA") else StartTracking()
+            except ProtocolError as error:
+                log.warning("%s of %s is refused: %s", request.type, peer.name, error)
+                done = False
+            else:
+                peer.started[kind] = start.resolution / 1000.0
+        peer.answer(replace(reply, content=Request(f"RTS_{kind}", b"\0" if done else b"\1")))

@@ -13,8 +13,9 @@ from echospline.openigtlink.image import Image
 from echospline.openigtlink.metadata import unwrap, wrap
 from echospline.openigtlink.ndarray import NDArrayMessage
 from echospline.openigtlink.polydata import Points, PolyData
-from echospline.openigtlink.pose import Position, Transform
+from echospline.openigtlink.pose import Position, QuaternionTransform, Transform
 from echospline.openigtlink.text import Capability, CommandMessage, CommandReply, Status, String
+from echospline.openigtlink.tools import QuaternionTrackingData, TrackingData
 
 PREFIXES = ("GET_", "STT_", "STP_", "RTS_")
 """A question, the start and the end of a stream, and the answer to these."""
@@ -76,7 +77,8 @@ class _Readable(Protocol):
 
 
 READABLE: tuple[type[_Readable], ...] = (
-    Transform, Position, Image, Status, String, CommandMessage, CommandReply, Points, PolyData, NDArrayMessage, Capability,
+    Transform, Position, QuaternionTransform, TrackingData, QuaternionTrackingData, Image, Status, String,
+    CommandMessage, CommandReply, Points, PolyData, NDArrayMessage, Capability,
 )  # fmt: skip
 _READERS = {kind.TYPE: kind for kind in READABLE}
 

@@ -10,7 +10,8 @@ from echospline.live import Snapshot
 from echospline.openigtlink.image import Image
 from echospline.openigtlink.message import Message
 from echospline.openigtlink.polydata import Attribute, Point, Points, PolyData
-from echospline.openigtlink.pose import Transform
+from echospline.openigtlink.pose import Position, QuaternionTransform, Transform, quaternion_of
+from echospline.openigtlink.tools import QuaternionTrackingData, Tool, TrackingData
 from echospline.openigtlink.transforms import Naming
 from echospline.picture import Drawing, NeedleEcho
 from echospline.scene import ImagingPlane, Pixels, RegularGrid, Visible
@@ -85,11 +86,20 @@ def image_message(
     return messages
 
 
-def needle_message(snapshot: Snapshot, plane: ImagingPlane, naming: Naming, now: float) -> Message:
-    """Build TRANSFORM of the needle in the picture."""
-    return Message(
-        Transform(plane.tip_matrix(snapshot.pose)), f"{naming.needles[0]}To{naming.reference}", now
-    )
+def needle_messages(snapshot: Snapshot, plane: ImagingPlane, naming: Naming, now: float) -> list[Message]:
+    """Build the messages of the needle in the picture: TRANSFORM for all; the others go to peers that asked for them."""
+    matrix, name = plane.tip_matrix(snapshot.pose), f"{naming.needles[0]}To{naming.reference}"
+    x, y, z = (float(v) for v in matrix[:3, 3])
+    position, quaternion = (x, y, z), quaternion_of(matrix)
+    # the tool's own name: the C++ library 1.11 reads none of 20 characters, and NeedleTipToReference has that many
+    tools = (Tool(naming.needles[0], matrix),)
+    return [
+        Message(Transform(matrix), name, now),
+        Message(TrackingData(tools), "echospline", now),
+        Message(QuaternionTrackingData(tools), "echospline", now),
+        Message(QuaternionTransform(position, quaternion), name, now),
+        Message(Position(position, quaternion), name, now),
+    ]
 
 
 def target_message(snapshot: Snapshot, plane: ImagingPlane, naming: Naming, now: float) -> Message | None:

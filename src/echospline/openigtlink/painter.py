@@ -13,7 +13,7 @@ from echospline.openigtlink.outgoing import (
     draw,
     image_message,
     mesh_message,
-    needle_message,
+    needle_messages,
     target_message,
 )
 from echospline.openigtlink.stage import Rates, Stage
@@ -83,7 +83,7 @@ class Painter:
     ) -> list[Message]:
         looks = self.looks
         messages = image_message(pixels, stage.image.grid, located.plane, looks, now)
-        messages.append(needle_message(snapshot, located.plane, looks.naming, now))
+        messages += needle_messages(snapshot, located.plane, looks.naming, now)
         targets = target_message(snapshot, located.plane, looks.naming, now)
         return messages if targets is None else [*messages, targets]
 

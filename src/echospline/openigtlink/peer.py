@@ -99,6 +99,9 @@ class Peer(asyncio.Protocol):
         """Header version sent to it: 1 until it sends version 2."""
         self.muted: set[str] = set()
         """Types that it asked not to receive (STP_)."""
+        self.started: dict[str, float] = {}
+        """Types that it asked to receive (STT_), with the shortest time between two messages, s."""
+        self._due: dict[Key, float] = {}
         self.sends: set[Key] = set()
         """Type and device of the messages that it sends."""
         self.messages = 0
@@ -125,6 +128,12 @@ class Peer(asyncio.Protocol):
         """Send as soon as the peer can take it, unless a newer one of its kind comes first."""
         if outgoing.message.type in self.muted or self._transport is None:
             return
+        interval = self.started.get(outgoing.message.type, 0.0)
+        if interval > 0.0:
+            now = asyncio.get_running_loop().time()
+            if now < self._due.get(outgoing.key, 0.0):
+                return
+            self._due[outgoing.key] = now + interval
         if outgoing.key in self._slots:
             self.skipped += 1
         self._slots[outgoing.key] = outgoing

@@ -1,4 +1,4 @@
-"""Pose of a tool: TRANSFORM (a 4 x 4 matrix) and POSITION (a point and a quaternion)."""
+"""Pose of a tool: TRANSFORM (a 4 x 4 matrix), POSITION and QTRANS (a point and a quaternion)."""
 
 from __future__ import annotations
 
@@ -65,10 +65,10 @@ class Position:
     def unpack(cls, content: memoryview) -> Position:
         """Unpack 12, 24 or 28 bytes."""
         if len(content) not in (12, 24, 28):
-            raise ProtocolError(f"a POSITION has 12, 24 or 28 bytes; got {len(content)}")
+            raise ProtocolError(f"a {cls.TYPE} has 12, 24 or 28 bytes; got {len(content)}")
         values = [float(v) for v in np.frombuffer(content, dtype=">f4")]
         if not np.isfinite(values).all():
-            raise ProtocolError("a POSITION must hold finite numbers; got NaN or infinity")
+            raise ProtocolError(f"a {cls.TYPE} must hold finite numbers; got NaN or infinity")
         x, y, z = values[3:6] or (0.0, 0.0, 0.0)
         w = values[6] if len(values) == 7 else max(0.0, 1.0 - x * x - y * y - z * z) ** 0.5
         return cls((values[0], values[1], values[2]), (x, y, z, w))
@@ -81,16 +81,55 @@ class Position:
         ProtocolError
             If the quaternion is not a rotation (its length is not 1 within a thousandth).
         """
-        x, y, z, w = self.quaternion
-        length = (x * x + y * y + z * z + w * w) ** 0.5
-        if abs(length - 1.0) > 1e-3:
-            raise ProtocolError(f"the quaternion of a POSITION has length 1; got {length:.4g}")
-        x, y, z, w = x / length, y / length, z / length, w / length
-        return np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w), self.position[0]],
-                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w), self.position[1]],
-                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y), self.position[2]],
-                [0.0, 0.0, 0.0, 1.0],
-            ]
-        )
+        matrix = np.eye(4)
+        matrix[:3, :3] = rotation_of(self.quaternion)
+        matrix[:3, 3] = self.position
+        return matrix
+
+
+@dataclass(frozen=True, eq=False)
+class QuaternionTransform(Position):
+    """QTRANS: the name that POSITION had in version 1 of the protocol; some trackers still send it."""
+
+    TYPE: ClassVar[str] = "QTRANS"
+
+
+def rotation_of(quaternion: tuple[float, float, float, float]) -> Floats:
+    """Return the 3 x 3 rotation of a unit quaternion (x, y, z, w).
+
+    Raises
+    ------
+    ProtocolError
+        If its length is not 1 within a thousandth.
+    """
+    x, y, z, w = quaternion
+    length = (x * x + y * y + z * z + w * w) ** 0.5
+    if not abs(length - 1.0) <= 1e-3:
+        raise ProtocolError(f"the quaternion of a pose has length 1; got {length:.4g}")
+    x, y, z, w = x / length, y / length, z / length, w / length
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def quaternion_of(matrix: Floats) -> tuple[float, float, float, float]:
+    """Return the unit quaternion (x, y, z, w >= 0) of the rotation in a 4 x 4 or 3 x 3 matrix.
+
+    The largest of the four components is computed first and divides the others, so that none loses its digits.
+    """
+    r = np.asarray(matrix, dtype=np.float64)
+    traces = np.array([r[0, 0] - r[1, 1] - r[2, 2], r[1, 1] - r[0, 0] - r[2, 2],
+                       r[2, 2] - r[0, 0] - r[1, 1], r[0, 0] + r[1, 1] + r[2, 2]])  # fmt: skip
+    largest = int(np.argmax(traces))
+    q = np.empty(4)
+    if largest == 3:
+        q[:] = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], 1 + traces[3]
+    else:
+        i, j, k = largest, (largest + 1) % 3, (largest + 2) % 3
+        q[i], q[j], q[k], q[3] = 1 + traces[i], r[j, i] + r[i, j], r[k, i] + r[i, k], r[k, j] - r[j, k]
+    q *= (-1.0 if q[3] < 0 else 1.0) / np.linalg.norm(q)
+    return float(q[0]), float(q[1]), float(q[2]), float(q[3])

@@ -11,10 +11,12 @@ from dataclasses import replace
 from types import TracebackType
 from typing import Self
 
+import numpy as np
+
 from echospline.errors import EchosplineError, InputError
 from echospline.live import LiveEngine, Metronome, Pacer
 from echospline.openigtlink.link import Link
-from echospline.openigtlink.message import Message
+from echospline.openigtlink.message import Message, Request
 from echospline.openigtlink.orders import Order, answer, carry_out, order_of
 from echospline.openigtlink.painter import Painter
 from echospline.openigtlink.peer import Peer
@@ -22,11 +24,21 @@ from echospline.openigtlink.pose import Position, Transform
 from echospline.openigtlink.stage import SessionOptions, Stage
 from echospline.openigtlink.status import status_of
 from echospline.openigtlink.text import Status
-from echospline.openigtlink.transforms import Tracking
-from echospline.scene import NeedlePose
+from echospline.openigtlink.tools import (
+    STREAMED_ON_REQUEST,
+    TRACKER_FRAME,
+    QuaternionTrackingData,
+    StartTracking,
+    TrackingData,
+    transform_name,
+)
+from echospline.openigtlink.transforms import Located, Tracking
+from echospline.scene import Floats, NeedlePose
 
 log = logging.getLogger("echospline.openigtlink")
 
+STATUS_KEY = "TransformStatus"
+"""Metadata of a transform in which PLUS gives its status."""
 ARRIVES = 1.0
 """mm; a needle that is first tracked deeper than this is placed there instead of pushed there."""
 
@@ -48,6 +60,8 @@ class Session:
     moved : callable, optional
         Called with the pose whenever the tracker moves the needle, and whether tracking of it has just begun (a page
         follows it).
+    tracked : callable, optional
+        Called with a sentence when the needle's tracking is lost, and with an empty one when it returns.
     """
 
     def __init__(
@@ -56,11 +70,12 @@ class Session:
         options: SessionOptions | None = None,
         load: Callable[[str], Stage] | None = None,
         moved: Callable[[NeedlePose, bool], None] | None = None,
+        tracked: Callable[[str], None] | None = None,
     ) -> None:
         self.options = options or SessionOptions()
         self.port = 0
         """Port actually bound, once the context is entered."""
-        self._load, self._moved = load, moved
+        self._load, self._moved, self._tracked = load, moved, tracked
         self._stop = threading.Event()
         self._ready = threading.Event()
         self._error: BaseException | None = None
@@ -69,9 +84,15 @@ class Session:
         self._followed = 0.0
         self._away = True
         self._stage, self._pacer = stage, Pacer(stage.engine)
-        self._tracking = Tracking(stage.image.grid, self.options.looks.naming)
+        self._tracking = Tracking(stage.image.grid, self.options.looks.naming, self.options.silence)
         self._located = self._tracking.locate()
-        self._link = Link(self._received, self.status, self.options.limits)
+        self._link = Link(
+            self._received,
+            self.status,
+            self.options.limits,
+            frozenset(STREAMED_ON_REQUEST),
+            start_and_stop(self.options, stage.engine.period),
+        )
         self._threads = [
             threading.Thread(target=self._run_link, name="echospline-link", daemon=True),
             threading.Thread(target=self._draw, name="echospline-picture", daemon=True),
@@ -144,6 +165,7 @@ class Session:
                 self._link.connect(host, port)
             self._ready.set()
             while not self._stop.is_set():
+                self._locate()  # silence is noticed without a message
                 await asyncio.sleep(0.05)
         finally:
             await self._link.close()
@@ -151,11 +173,15 @@ class Session:
     def _received(self, peer: Peer, message: Message) -> None:
         content = message.content
         if isinstance(content, Transform):
-            self._tracking.put(message.device, content.matrix)
-            self._follow_soon()
+            self._put(message, message.device, content.matrix)
         elif isinstance(content, Position):
-            self._tracking.put(message.device, content.matrix())
-            self._follow_soon()
+            try:
+                matrix = content.matrix()
+            except InputError:
+                matrix = np.full((4, 4), np.nan)  # refused as every matrix that no tool can have
+            self._put(message, message.device, matrix)
+        elif isinstance(content, TrackingData | QuaternionTrackingData):
+            self._put_tools(message, content)
         else:
             try:
                 order = order_of(message)
@@ -164,6 +190,28 @@ class Session:
                 return
             if order is not None:
                 self._carry_out(peer, message, order)
+
+    def _put(self, message: Message, name: str, matrix: Floats) -> None:
+        now = self._now()
+        try:
+            self._tracking.put(name, matrix, message.metadata.get(STATUS_KEY, ""), now)
+        finally:
+            self._follow_soon()
+
+    def _put_tools(self, message: Message, content: TrackingData | QuaternionTrackingData) -> None:
+        """Take every tool that can be taken; then raise for the first that cannot."""
+        refused: InputError | None = None
+        for tool in content.tools:
+            try:
+                self._put(message, transform_name(tool), tool.matrix)
+            except InputError as error:
+                refused = refused or error
+        if refused is not None:
+            raise refused
+
+    def _now(self) -> float:
+        assert self._loop is not None  # messages come while it runs
+        return self._loop.time()
 
     def _follow_soon(self) -> None:
         """Follow the newest transforms once per step, however many come."""
@@ -174,13 +222,10 @@ class Session:
         self._loop.call_later(max(0.0, pause), self._follow)
 
     def _follow(self) -> None:
-        assert self._loop is not None  # it calls this method
-        self._following, self._followed = False, self._loop.time()
-        before, self._located = self._located, self._tracking.locate()
-        if self._located.trouble != before.trouble and self._located.trouble:
-            log.warning("%s", self._located.trouble)
-        needle = self._located.needle
-        if needle is None:
+        self._following, self._followed = False, self._now()
+        located = self._locate()
+        needle = located.needle
+        if needle is None or located.held:
             return
         engine, pose = self._stage.engine, needle.pose(self._stage.image.grid, self.options.reach)
         # A needle that is inserted when tracking begins was not pushed there in this step.
@@ -189,6 +234,19 @@ class Session:
         (engine.place if appears else engine.command)(pose.entry, pose.tip)
         if self._moved is not None:
             self._moved(pose, appears)
+
+    def _locate(self) -> Located:
+        """Locate plane and needle; a change of their fault is logged once, and told once to the pages."""
+        before, now = self._located, self._tracking.locate(self._now())
+        self._located = now
+        if (now.fault, now.about) != (before.fault, before.about):
+            if now.fault == "":
+                log.info("tracking is back: %s", before.about or "the needle")
+            elif now.fault != "Refused":  # the peer's refusal has logged that
+                log.warning("%s", now.trouble)
+            if self._tracked is not None and (now.held or before.held):
+                self._tracked(f"The tracker: {now.trouble}" if now.held else "")
+        return now
 
     def _carry_out(self, peer: Peer, message: Message, order: Order) -> None:
         log.info("%s orders: %s %s", peer.name, order.name, order.argument)
@@ -216,7 +274,7 @@ class Session:
             peer.answer(answer(message, f"{name} failed: {type(error).__name__}: {error}", done=False))
             return
         old, self._pacer = self._pacer, Pacer(stage.engine)
-        self._tracking = Tracking(stage.image.grid, self.options.looks.naming)
+        self._tracking = Tracking(stage.image.grid, self.options.looks.naming, self.options.silence)
         self._located = replace(self._tracking.locate(), needle=None)
         self._stage, self._away = stage, True
         self._pacer.start()
@@ -243,3 +301,21 @@ class Session:
                 self._loop.call_soon_threadsafe(self._publish, messages)
             except RuntimeError:  # closed since the check above
                 return
+
+
+def start_and_stop(options: SessionOptions, period: float) -> tuple[Message, Message] | None:
+    """Build the messages that start and end the stream of a server that a session connects to; None where it is not asked.
+
+    Parameters
+    ----------
+    options : SessionOptions
+        Its ``ask`` names the type.
+    period : float
+        Shortest time between two messages, s.
+    """
+    kind = options.ask
+    if not kind:
+        return None
+    # QTRANS and POSITION are started without a word on the rate
+    body = StartTracking(round(1000 * period), TRACKER_FRAME).pack() if kind.endswith("DATA") else b""
+    return Message(Request(f"STT_{kind}", body), "echospline"), Message(Request(f"STP_{kind}"), "echospline")

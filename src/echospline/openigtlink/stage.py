@@ -7,8 +7,10 @@ from math import isfinite
 
 from echospline.errors import InputError
 from echospline.live import LiveEngine
-from echospline.openigtlink.link import PORT, LinkLimits
+from echospline.openigtlink.header import PORT
+from echospline.openigtlink.link import LinkLimits
 from echospline.openigtlink.outgoing import Looks
+from echospline.openigtlink.tools import STREAMED_ON_REQUEST
 from echospline.scene import Insertion, Reach, UltrasoundImage
 
 
@@ -80,6 +82,15 @@ class SessionOptions:
         Rates of sending.
     limits : LinkLimits
         Limits of the link.
+    silence : float
+        Seconds without a transform after which the needle counts as stale.
+    ask : {"TDATA", "QTDATA", "QTRANS", "POSITION", ""}
+        Stream that servers in ``connect`` are asked to start; empty asks nothing.
+
+    Raises
+    ------
+    InputError
+        If the silence is not positive or there is no such stream.
     """
 
     host: str = "127.0.0.1"
@@ -89,3 +100,11 @@ class SessionOptions:
     reach: Reach = field(default_factory=Reach)
     rates: Rates = field(default_factory=Rates)
     limits: LinkLimits = field(default_factory=LinkLimits)
+    silence: float = 0.5
+    ask: str = "TDATA"
+
+    def __post_init__(self) -> None:
+        if not (isfinite(self.silence) and self.silence > 0):
+            raise InputError(f"the silence is a positive number of s; got {self.silence}")
+        if self.ask and self.ask not in STREAMED_ON_REQUEST:
+            raise InputError(f"a stream is one of {', '.join(STREAMED_ON_REQUEST)}; got {self.ask!r}")

@@ -29,11 +29,13 @@ def status_of(snapshot: Snapshot, located: Located, grid: RegularGrid, reach: Re
             "ModelFailed",
             f"{snapshot.model} failed: {snapshot.failure}; reset to go on",
         )
-    if located.trouble:
-        return Status(NOT_READY, 0, "Transforms", located.trouble)
+    if located.trouble and not (located.held and located.needle):
+        return Status(NOT_READY, 0, located.fault, located.trouble)
     state = "frozen" if snapshot.frozen else "playing" if snapshot.replaying else "live"
     x, y = snapshot.pose.tip
     told = f"{snapshot.model}, {state}; tip {x:.1f} {y:.1f} mm, depth {snapshot.pose.depth:.1f} mm"
+    if located.held:
+        return Status(NOT_READY, 0, located.fault, f"{located.trouble}: {told}")
     if located.needle is None:
         return Status(text=f"{told}; no tracked needle yet")
     seen = located.needle.seen(grid.extent[2], reach)

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from echospline.errors import InputError
+from echospline.openigtlink.tools import TRACKER_FRAME
 from echospline.scene import (
     AXIAL,
     Floats,
@@ -13,12 +17,18 @@ from echospline.scene import (
     RegularGrid,
     TrackedNeedle,
     as_transform,
+    chain_between,
     frames_of,
     transform_between,
 )
 
 MOST = 100
 """Transforms stored at most; a tracker has a dozen."""
+RIGID = 0.02
+"""Deviation of axes from length 1 and from right angles (1.1 degrees); trackers round to four digits, scales are gross."""
+FARTHEST = 1e4
+"""mm; no tracker sees a tool at 10 m."""
+_STAYS = "the needle stays where it was"
 
 
 @dataclass(frozen=True)
@@ -58,18 +68,43 @@ class Located:
     plane : ImagingPlane
         Plane of the image.
     needle : TrackedNeedle or None
-        The needle, if a chain of transforms leads to it.
+        The needle, if a chain of transforms leads to it; where it was last known to be while ``held``.
     trouble : str
         Description of a fault; empty if there is none.
+    fault : {"", "Transforms", "Invalid", "Stale", "Refused"}
+        Kind of the fault: no chain of transforms, a status other than OK, silence, a matrix that no tool can have.
+    about : str
+        Name of the transform at fault.
+    held : bool
+        Whether the needle stays where it was.
     """
 
     plane: ImagingPlane
     needle: TrackedNeedle | None
     trouble: str = ""
+    fault: str = ""
+    about: str = ""
+    held: bool = False
+
+
+@dataclass
+class _Heard:
+    """One transform as its tracker sends it."""
+
+    matrix: Floats | None = None
+    at: float = 0.0
+    count: int = 0
+    status: str = ""
+    refusal: str = ""
+    kind: str = ""
+    unit_settled: bool = False
 
 
 class Tracking:
     """Stores the newest transform of each name; `locate` combines them.
+
+    A transform whose status is not OK, or that no tool can have, leaves the one before it in force, and the needle where
+    it was. Times are those of the receiver: the clocks of trackers are not set.
 
     Parameters
     ----------
@@ -77,32 +112,104 @@ class Tracking:
         The image's pixels.
     naming : Naming
         Names of frames.
+    silence : float
+        Seconds without a transform after which the needle counts as stale.
     """
 
-    def __init__(self, grid: RegularGrid, naming: Naming) -> None:
-        self.grid, self.naming = grid, naming
-        self._known: dict[str, Floats] = {}
+    def __init__(self, grid: RegularGrid, naming: Naming, silence: float = 0.5) -> None:
+        self.grid, self.naming, self.silence = grid, naming, silence
+        self._heard: dict[str, _Heard] = {}
+        self._good: TrackedNeedle | None = None
         for name, matrix in naming.calibration.items():
             frames_of(name)
             as_transform(matrix)
 
-    def put(self, name: str, matrix: Floats) -> None:
-        """Store a transform.
+    def put(self, name: str, matrix: Floats, status: str = "", now: float = 0.0) -> None:
+        """Store a transform, unless its status or its numbers forbid.
+
+        Parameters
+        ----------
+        name : str
+            <From>To<To>.
+        matrix : ndarray, shape (4, 4)
+            As received.
+        status : str
+            The sender's word on it (``OK``, ``INVALID``, ``MISSING`` ...); empty where it gives none.
+        now : float
+            The receiver's clock, s.
 
         Raises
         ------
         InputError
-            If its name is not <From>To<To>, or there are too many.
+            If its name is not <From>To<To>, or there are too many; and once for every kind of matrix that no tool can
+            have: repeated ones are refused in silence, until a good one comes.
         """
         frames_of(name)
-        if name not in self._known and len(self._known) >= MOST:
+        if name not in self._heard and len(self._heard) >= MOST:
             raise InputError(f"at most {MOST} transforms are remembered; {name} is one too many")
-        self._known[name] = matrix
+        heard = self._heard.setdefault(name, _Heard())
+        heard.at, heard.count = now, heard.count + 1
+        heard.status = "" if is_valid(status) else status.strip().upper()[:40]
+        if heard.status:
+            return
+        kind, reason = self._refusal(name, matrix, settled=heard.unit_settled)
+        if kind:
+            known, heard.kind = heard.kind, kind
+            if known != kind:
+                heard.refusal = reason
+                raise InputError(f"{name}: {reason}")
+            return
+        heard.matrix, heard.refusal, heard.kind = as_transform(matrix), "", ""
+        heard.unit_settled = heard.unit_settled or math.hypot(*matrix[:3, 3]) >= self._least(name)
 
-    def locate(self) -> Located:
-        """Locate plane and needle by the newest transforms."""
+    def _least(self, name: str) -> float:
+        """Return the distance below which mm are doubted, mm: a tool is never within 3 mm of its tracker.
+
+        A tip in the reference frame can be, but not within 1 mm from the first moment on, unless it lies at 0 exactly.
+        """
+        start, end = frames_of(name)
+        if end == TRACKER_FRAME:
+            return 3.0
+        return 1.0 if start in self.naming.needles and end == self.naming.reference else 0.0
+
+    def _refusal(self, name: str, matrix: Floats, *, settled: bool) -> tuple[str, str]:
+        """Return kind and reason if no tool can have this matrix; the image's own may be scaled to pixels."""
+        if (
+            np.shape(matrix) != (4, 4)
+            or not np.isfinite(matrix).all()
+            or not np.array_equal(matrix[3], (0, 0, 0, 1))
+        ):
+            return "numbers", (
+                "expected 4 x 4 finite numbers with the last row 0 0 0 1, and a unit quaternion where there is one"
+            )
+        if self.naming.image in frames_of(name):
+            return "", ""
+        kind, reason = rigid_fault(matrix)
+        if kind:
+            return kind, reason
+        distance = math.hypot(*matrix[:3, 3])
+        if distance > FARTHEST:
+            return "far", (
+                f"expected a translation in mm; got {distance:.4g}, farther than any tracker sees: "
+                "are these micrometres? Send mm"
+            )
+        if not settled and 0.0 < distance < self._least(name):
+            return "near", (
+                f"expected a translation in mm; got {distance:.2g}, nearer than a tool can be: "
+                "are these metres? Send mm"
+            )
+        return "", ""
+
+    def locate(self, now: float = 0.0) -> Located:
+        """Locate plane and needle by the newest transforms.
+
+        Parameters
+        ----------
+        now : float
+            The receiver's clock, s.
+        """
         n = self.naming
-        known = {**n.calibration, **self._known}
+        known = dict(n.calibration) | {k: h.matrix for k, h in self._heard.items() if h.matrix is not None}
         plane, trouble = n.plane, ""
         image = transform_between(known, n.image, n.reference)
         if image is not None:
@@ -111,12 +218,71 @@ class Tracking:
             except InputError as error:
                 trouble = str(error)
         for frame in n.needles:
-            tip = transform_between(known, frame, n.reference)
-            if tip is not None:
-                return Located(plane, plane.see(tip, n.axis), trouble)
-        if self._known and not trouble:
+            found = chain_between(known, frame, n.reference)
+            if found is None:
+                continue
+            tip, chain = found
+            fault, about, reason = self._fault(chain, tip, now)
+            if self._good is None and not rigid_fault(tip)[0]:
+                self._good = plane.see(tip, n.axis)
+            if fault:
+                return Located(plane, self._good, f"{reason}; {_STAYS}", fault, about, held=True)
+            self._good = plane.see(tip, n.axis)
+            return Located(plane, self._good, trouble, "Transforms" if trouble else "")
+        for name, heard in self._heard.items():
+            if heard.status or heard.kind:
+                fault, reason = self._spoken(name, heard)
+                return Located(plane, None, f"{reason}; no tracked needle yet", fault, name)
+        if self._heard and not trouble:
             trouble = (
                 f"no transform leads from {' or '.join(n.needles)} to {n.reference}; "
                 f"there are {', '.join(sorted(known))}"
             )
-        return Located(plane, None, trouble)
+        return Located(plane, None, trouble, "Transforms" if trouble else "")
+
+    def _fault(self, chain: tuple[str, ...], tip: Floats, now: float) -> tuple[str, str, str]:
+        """Return kind, name and reason if the needle at the end of this chain is not known now."""
+        heard = {name: self._heard[name] for name in chain if name in self._heard}
+        for name, one in heard.items():
+            if one.status or one.kind:
+                return (fault := self._spoken(name, one))[0], name, fault[1]
+        # a transform that came once is a setting, not a stream: it may rest as long as another one goes on
+        streams = {name: one for name, one in heard.items() if one.count > 1} or heard
+        if streams:
+            name, oldest = min(streams.items(), key=lambda item: item[1].at)
+            if now - oldest.at > self.silence:
+                return "Stale", name, f"stale: {name} has been silent for {now - oldest.at:.1f} s"
+        kind, reason = rigid_fault(tip)
+        return ("Refused", chain[0], f"{' * '.join(chain)}: {reason}") if kind else ("", "", "")
+
+    @staticmethod
+    def _spoken(name: str, heard: _Heard) -> tuple[str, str]:
+        if heard.status:
+            return "Invalid", f"{name} is {heard.status}"
+        return "Refused", f"{name} is refused: {heard.refusal}"
+
+
+def is_valid(status: str) -> bool:
+    """Test whether a tracker's status lets its transform be used: OK, a pressed switch, or none given."""
+    word = status.strip().upper().removeprefix("TOOL_")
+    return word in ("", "OK") or (word.startswith("SWITCH") and word.endswith("_IS_ON"))
+
+
+def rigid_fault(matrix: Floats) -> tuple[str, str]:
+    """Return kind and description of what keeps a finite 4 x 4 matrix from being a motion of a rigid tool; empty if nothing does.
+
+    Axes count as perpendicular and of length 1 within `RIGID`.
+    """
+    axes = matrix[:3, :3]
+    largest = np.abs(axes).max()
+    lengths = np.linalg.norm(axes, axis=0) if largest < 1e6 else np.full(3, largest)
+    said = ", ".join(f"{v:.4g}" for v in lengths)
+    if lengths.min() < 1e-6:
+        return "empty", f"expected axes of length 1; got {said}: the tool is probably not seen"
+    if np.abs(lengths - 1.0).max() > RIGID:
+        return "scaled", f"expected axes of length 1; got {said}: a tool's transform has no scale, send mm"
+    if np.abs(axes.T @ axes - np.diag(lengths**2)).max() > RIGID:
+        return "skewed", "expected perpendicular axes: a tool's transform has no skew"
+    if np.linalg.det(axes) < 0:
+        return "mirrored", "expected a right-handed rotation; got a mirrored one: one axis has the wrong sign"
+    return "", ""

@@ -8,7 +8,7 @@ from typing import Literal
 
 from echospline.errors import FoldingError, InputError
 from echospline.picture.deformation import Deformation, Folds, InverseMap
-from echospline.picture.native import LARGEST, Border, Inverse, NativePicture
+from echospline.picture.native import LARGEST, Border, Inverse, NativePicture, check_border
 from echospline.picture.needle_echo import NeedleEcho, draw_needle, white_of
 from echospline.picture.warp import in_core, warp
 from echospline.scene import ZERO_LENGTH, Floats, NeedlePose, RegularGrid, UltrasoundImage
@@ -78,6 +78,7 @@ class Drawing:
             raise InputError(f'inverse is "auto" or "exact"; got {inverse!r}')
         if folding not in ("flag", "refuse"):
             raise InputError(f'folding is "flag" or "refuse"; got {folding!r}')
+        check_border(border, image.pixels)
         self.image, self.mesh = image, mesh
         self._border, self._folding, self._form_image = border, folding, form_image
         self._white = white_of(image.pixels)

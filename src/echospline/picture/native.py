@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echospline import _native as core
-from echospline.scene import Floats, Pixels, RegularGrid
+from echospline.errors import InputError
+from echospline.scene import Floats, Pixels, RegularGrid, is_number
 
 Inverse = Literal["auto", "exact"]
 Border = float | Literal["transparent"]
@@ -32,6 +33,29 @@ LARGEST = 1e6
 """Grey level beyond which the core takes no border and no white."""
 INTERPOLATIONS = {"linear": core.Interpolation.LINEAR, "nearest": core.Interpolation.NEAREST}
 METHODS = {"auto": core.Method.METHOD_AUTO, "exact": core.Method.METHOD_EXACT}
+
+
+def check_border(border: Border, pixels: Pixels) -> None:
+    """Refuse a border that pixels of this type cannot hold.
+
+    Raises
+    ------
+    InputError
+        If it is no finite number, or out of the type's range.
+    """
+    if border == "transparent":
+        return
+    kind: Any = pixels.dtype
+    low, high = (-np.inf, np.inf)
+    if np.issubdtype(kind, np.integer):
+        low, high = float(np.iinfo(kind).min), float(np.iinfo(kind).max)
+    if not is_number(border) or not low <= border <= high:
+        span = (
+            f"from {low:g} to {high:g}, as pixels of {kind} hold it,"
+            if np.isfinite(low)
+            else "that is finite"
+        )
+        raise InputError(f'border must be a number {span} or "transparent"; got {border!r}')
 
 
 def drawable(pixels: Pixels) -> bool:

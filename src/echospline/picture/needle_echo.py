@@ -27,9 +27,10 @@ from echospline.scene import (
     RegularGrid,
     UltrasoundImage,
     as_points,
+    is_number,
 )
 
-OUTER_DIAMETER = {
+OUTER_DIAMETER: dict[int, float] = {
     14: 2.108, 15: 1.829, 16: 1.651, 17: 1.473, 18: 1.270, 19: 1.067,
     20: 0.908, 21: 0.819, 22: 0.718, 23: 0.642, 24: 0.566, 25: 0.515,
 }  # fmt: skip
@@ -144,7 +145,10 @@ class NeedleEcho:
             )
         if self.apex is not None:
             as_points(self.apex, "apex")
-        if not 0 <= self.seed < 2**32:
+        for name in _NUMBERS:
+            if not is_number(getattr(self, name)):
+                raise InputError(f"{name} of a needle must be a finite number; got {getattr(self, name)!r}")
+        if not (int(self.seed) == self.seed and 0 <= self.seed < 2**32):
             raise InputError(f"seed must be a whole number from 0 to {2**32 - 1}; got {self.seed}")
         needle_echo(np.empty((0, 2)), NeedlePose((0.0, 0.0), (0.0, 1.0)), self)  # the core checks the ranges
 

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from math import ceil, isfinite
+from math import ceil
 from time import perf_counter
 from typing import Literal
 
 from echospline.errors import FoldingError, InputError
-from echospline.mechanics.protocol import State, TissueModel
+from echospline.mechanics.protocol import NeedleLoad, State, TissueModel, needle_load
 from echospline.picture.deformation import Folds
 from echospline.picture.drawing import Drawing, ImageFormer
 from echospline.picture.native import Border, Inverse
 from echospline.picture.needle_echo import NeedleEcho
-from echospline.scene import Floats, Insertion, NeedlePose, UltrasoundImage
+from echospline.scene import Floats, Insertion, NeedlePose, UltrasoundImage, is_number
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,8 @@ class Frame:
         Where the deformation folds.
     milliseconds : dict
         Time spent per stage: interaction, spline, picture (deformation, check, sampling and needle).
+    load : NeedleLoad or None
+        The needle's forces; None where the model has none.
     """
 
     index: int
@@ -49,6 +51,7 @@ class Frame:
     residual: float = 0.0
     folds: Folds | None = None
     milliseconds: dict[str, float] = field(default_factory=dict)
+    load: NeedleLoad | None = None
 
 
 def frame_count(insertion: Insertion, fps: float) -> int:
@@ -59,7 +62,7 @@ def frame_count(insertion: Insertion, fps: float) -> int:
     InputError
         If fps is not positive.
     """
-    if not (isfinite(fps) and fps > 0):
+    if not (is_number(fps) and fps > 0):
         raise InputError(f"fps must be a positive number of frames per second; got {fps}")
     return int(insertion.duration * fps + 1e-9) + 1
 
@@ -116,7 +119,7 @@ def simulate(
         If the picture folds and ``folding="refuse"``.
     """
     count = frame_count(insertion, fps)
-    if not (isfinite(longest_step) and longest_step > 0):
+    if not (is_number(longest_step) and longest_step > 0):
         raise InputError(f"longest_step must be a positive number of seconds; got {longest_step}")
     steps = max(1, ceil(1.0 / fps / longest_step - 1e-9))
     start = float(insertion.times[0])
@@ -138,7 +141,10 @@ def simulate(
         except FoldingError as error:
             raise FoldingError(f"at {index / fps:.2f} s {error}") from None
         clock.stage("picture")
-        yield Frame(index, index / fps, pose, u, drawn.image, drawn.residual, drawn.folds, clock.milliseconds)
+        load = needle_load(model, state)
+        yield Frame(
+            index, index / fps, pose, u, drawn.image, drawn.residual, drawn.folds, clock.milliseconds, load
+        )
 
 
 class _Stopwatch:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import Normal, Stroke
 from numpy.typing import NDArray
 
-from echospline.atomic import give_name, part_of, writing
+from echospline.atomic import appearing
 from echospline.errors import InputError
 from echospline.scene import Floats, NeedlePose, RegularGrid, UltrasoundImage
 
@@ -223,14 +223,10 @@ def save(figure: Figure, path: str | Path, *, dpi: int = 130) -> None:
     if path.suffix.lower() not in FORMATS:
         raise InputError(f"a figure is written as {', '.join(FORMATS)}; got {path.name!r}")
     FigureCanvasAgg(figure)
-    with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with appearing(path) as part:
         kind = path.suffix.lower()[1:]
         # Without a date in it, the same run gives the same file.
-        figure.savefig(
-            part_of(path), format=kind, dpi=dpi, metadata={_DATE[kind]: None} if kind in _DATE else None
-        )
-        give_name(part_of(path), path)
+        figure.savefig(part, format=kind, dpi=dpi, metadata={_DATE[kind]: None} if kind in _DATE else None)
 
 
 def _edges(grid: RegularGrid) -> tuple[float, float, float, float]:

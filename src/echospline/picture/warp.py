@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
-import cv2
 import numpy as np
 
 from echospline.errors import FoldingError, InputError
 from echospline.picture.deformation import Deformation, Folds, InverseMap
-from echospline.picture.native import LARGEST, Border, NativePicture, drawable
+from echospline.picture.native import LARGEST, Border, NativePicture, check_border, drawable
 from echospline.scene import Pixels, UltrasoundImage
 
 Interpolation = Literal["linear", "nearest", "cubic"]
-FLAGS = {"linear": cv2.INTER_LINEAR, "nearest": cv2.INTER_NEAREST, "cubic": cv2.INTER_CUBIC}
+INTERPOLATIONS: tuple[Interpolation, ...] = get_args(Interpolation)
 NATIVE = (np.uint8, np.uint16, np.int16, np.float32, np.float64)
 """Types that OpenCV resamples as they are; others go through float64 and come back rounded."""
 
@@ -56,10 +55,11 @@ def warp(
     InputError
         If an option is unknown or the inverse map belongs to another grid.
     """
-    if interpolation not in FLAGS:
-        raise InputError(f"interpolation is one of {', '.join(FLAGS)}; got {interpolation!r}")
+    if interpolation not in INTERPOLATIONS:
+        raise InputError(f"interpolation is one of {', '.join(INTERPOLATIONS)}; got {interpolation!r}")
     if folding not in ("flag", "refuse"):
         raise InputError(f'folding is "flag" or "refuse"; got {folding!r}')
+    check_border(border, image.pixels)
     if isinstance(deformation, Deformation):
         if interpolation != "cubic" and in_core(image, border):
             picture = NativePicture(
@@ -78,7 +78,7 @@ def warp(
     if inverse.grid.shape != image.grid.shape:
         raise InputError(f"the inverse map has grid {inverse.grid.shape}, the image {image.grid.shape}")
     fill = 0.0 if border == "transparent" else float(border)
-    pixels = _resample(image.pixels, inverse, fill, FLAGS[interpolation])
+    pixels = _resample(image.pixels, inverse, fill, interpolation)
     if border == "transparent":
         pixels = _with_alpha(pixels, inverse)
     return UltrasoundImage(pixels, image.grid, image.source)
@@ -94,7 +94,10 @@ def _refuse(folds: Folds | None) -> None:
         raise FoldingError(f"{folds}: push less far, or allow it with folding flagged")
 
 
-def _resample(pixels: Pixels, inverse: InverseMap, fill: float, flag: int) -> Pixels:
+def _resample(pixels: Pixels, inverse: InverseMap, fill: float, interpolation: Interpolation) -> Pixels:
+    import cv2  # noqa: PLC0415  (the core draws most pictures: OpenCV is loaded for those that it does not)
+
+    flag = {"linear": cv2.INTER_LINEAR, "nearest": cv2.INTER_NEAREST, "cubic": cv2.INTER_CUBIC}[interpolation]
     native = pixels.dtype.type in NATIVE
     source: Any = np.ascontiguousarray(pixels if native else pixels.astype(np.float64))
     # half a pixel beyond the outermost centres the tissue is still that of the outermost pixel
@@ -103,7 +106,7 @@ def _resample(pixels: Pixels, inverse: InverseMap, fill: float, flag: int) -> Pi
         if np.issubdtype(pixels.dtype, np.integer):
             moved = np.rint(moved)
         moved = moved.astype(pixels.dtype)
-    if flag == cv2.INTER_CUBIC and pixels.size:
+    if interpolation == "cubic" and pixels.size:
         moved = np.clip(moved, pixels.min(), pixels.max())
     if inverse.outside.any():
         moved[inverse.outside] = fill

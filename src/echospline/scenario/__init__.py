@@ -1,11 +1,25 @@
-"""Scenario files: their tables and messages, and the models that they name.
+"""Scenario files: their tables and messages, the models that they name, and their runs."""
 
-`run` is imported by its own name: it loads the writers of sequences.
-"""
+from typing import TYPE_CHECKING
 
-from echospline.scenario.models import MODELS, build_model
-from echospline.scenario.scenario import LARGEST_FILE, PHANTOM, Scenario, describe, load, validated
-from echospline.scenario.sections import DiscSection, ExerciseSection
+from echospline.menu import on_demand
+
+if TYPE_CHECKING:  # the menu, loaded on demand
+    from echospline.scenario.models import MODELS, build_model
+    from echospline.scenario.run import run
+    from echospline.scenario.scale import (
+        PHANTOM,
+        check,
+        check_points,
+        check_store,
+        needle_doubts,
+        prepared,
+        size_doubts,
+    )
+    from echospline.scenario.scenario import LARGEST_FILE, Scenario, describe, load, validated
+    from echospline.scenario.sections import DiscSection, ExerciseSection
+else:
+    on_demand(__name__)
 
 __all__ = [
     "LARGEST_FILE",
@@ -15,7 +29,14 @@ __all__ = [
     "ExerciseSection",
     "Scenario",
     "build_model",
+    "check",
+    "check_points",
+    "check_store",
     "describe",
     "load",
+    "needle_doubts",
+    "prepared",
+    "run",
+    "size_doubts",
     "validated",
 ]

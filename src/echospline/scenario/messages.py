@@ -26,13 +26,14 @@ def describe(root: type[BaseModel], key: str) -> str:
         most = "" if high is None else f"{getattr(high, 'le', getattr(high, 'lt', None)):g}"
         words.append(f"range {least} to {most}" if most else f"from {least}")
     if field.default is not None and not isinstance(field.default, BaseModel):
-        words.append(f"default {_plain(field.default)}")
+        extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
+        words.append(f"default {_plain(field.default, str(extra.get('between', ',')))}")
     return "; ".join(w for w in words if w)
 
 
-def _plain(value: object) -> str:
+def _plain(value: object, between: str) -> str:
     if isinstance(value, tuple | list):
-        return ",".join(f"{v:g}" if isinstance(v, float) else str(v) for v in value) or "none"
+        return between.join(f"{v:g}" if isinstance(v, float) else str(v) for v in value) or "none"
     if isinstance(value, bool):
         return "yes" if value else "no"
     return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -10,16 +11,21 @@ from echospline.mechanics import (
     Clamps,
     Elastic,
     FEMModel,
+    Forces,
     GreenModel,
     Kernel,
     NeedleForces,
+    NeoHookeanModel,
     ThinPlate,
     TPSModel,
     TPSParameters,
+    ViscousForces,
+    anchors_for,
     landmark_stiffness,
 )
 from echospline.mechanics.protocol import TissueModel
 from echospline.scenario.scenario import Scenario
+from echospline.scenario.sections import ForceSection
 from echospline.scene import RegularGrid
 
 MODELS = ("tps", "elastic", "green", "fem")
@@ -48,21 +54,42 @@ def build_model(
     """
     kind = kind or scenario.model.kind
     tissue = scenario.make_tissue(folder or Path(), grid)
-    clamped, points = scenario.mesh.clamped, scenario.mesh.clamped_points
+    neo_hookean = scenario.tissue.material == "neo-hookean"
+    if neo_hookean and kind in MODELS and kind != "fem":
+        raise InputError(
+            f"tissue.material = 'neo-hookean' is large deformation, which finite elements alone compute: choose model fem, or "
+            f"material linear; got model {kind}"
+        )
+    mesh = scenario.mesh
+    clamped, sliding, points = mesh.clamped, mesh.sliding, mesh.clamped_points
     if kind in ("fem", "green"):
-        forces = NeedleForces(**scenario.model.forces.model_dump())
+        forces = _forces(scenario.model.forces)
         if kind == "fem":
-            return FEMModel(grid, clamped, tissue, forces, clamped_points=points)
-        radius = scenario.model.green.radius
-        return GreenModel(grid, clamped, tissue, forces, clamped_points=points, radius=radius)
-    parameters = TPSParameters(**scenario.model.landmarks.model_dump())
+            linear = FEMModel(grid, clamped, tissue, forces, sliding=sliding, clamped_points=points)
+            return NeoHookeanModel(linear) if neo_hookean else linear
+        green = scenario.model.green.model_dump()
+        return GreenModel(grid, clamped, tissue, forces, sliding=sliding, clamped_points=points, **green)
+    landmarks = scenario.model.landmarks.model_dump(exclude_none=True)
+    if (
+        kind == "elastic" and sliding
+    ):  # further apart, a fifth of a displacement passes through a sliding edge between anchors
+        landmarks.setdefault("anchor_spacing", 1.0)
+    parameters = TPSParameters(**landmarks)
     kernel: Kernel = ThinPlate()
     if kind == "elastic":
         section = scenario.model.elastic
         nu = tissue.poisson if section.poisson is None else section.poisson
         kernel = Elastic(nu, section.radius, tissue.plane)
     if kind in ("tps", "elastic"):
-        anchors = Clamps.of(grid, clamped, points).anchors(parameters.anchor_spacing)
+        anchors = anchors_for(Clamps.of(grid, clamped, points, sliding), kernel, parameters.anchor_spacing)
         stiffness = None if tissue.homogeneous else landmark_stiffness(tissue, grid, kernel, anchors)
-        return TPSModel(grid, clamped, parameters, kernel, clamped_points=points, stiffness=stiffness)
+        return TPSModel(
+            grid, clamped, parameters, kernel, sliding=sliding, clamped_points=points, stiffness=stiffness
+        )
     raise InputError(f"a model is one of {', '.join(MODELS)}; got {kind!r}")
+
+
+def _forces(section: ForceSection) -> Forces:
+    """Build the law of forces that a scenario names."""
+    law = ViscousForces if section.law == "viscous" else NeedleForces
+    return law(**section.model_dump(include={parameter.name for parameter in fields(law)}))

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 
 from echospline.errors import InputError
-from echospline.laboratory import Inclusion, Layer, Phantom
 from echospline.scenario.sections import Millimetres, Point, Section
 from echospline.scene import Display, RegularGrid, Transducer, UltrasoundImage
+
+if TYPE_CHECKING:  # the laboratory is loaded when a phantom is made
+    from echospline.laboratory import Inclusion, Layer, Phantom
 
 
 class ProbeSection(Section):
@@ -59,6 +61,8 @@ class EchogenicitySection(Section):
         InputError
             If both or none of layer and ellipse are given.
         """
+        from echospline.laboratory import Inclusion, Layer  # noqa: PLC0415
+
         if self.layer is not None and self.ellipse is None:
             return Layer(*self.layer, self.level)
         if self.ellipse is not None and self.layer is None:
@@ -98,6 +102,8 @@ class PhantomSection(Section):
 
     def phantom(self, probe: Transducer) -> Phantom:
         """Scatter the phantom."""
+        from echospline.laboratory import Phantom  # noqa: PLC0415
+
         regions = tuple(r.region() for r in self.region)
         return Phantom(probe, self.grid(), self.seed, self.per_cell, regions)
 

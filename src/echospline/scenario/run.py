@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -16,12 +16,11 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from echospline.atomic import give_name, part_of
-from echospline.errors import InputError
+from echospline.atomic import appearing, writing
 from echospline.io import DisplacementWriter, open_writer
 from echospline.io.sequence import SequenceWriter
 from echospline.mechanics import describe_core
-from echospline.mechanics.protocol import State, TissueModel
+from echospline.mechanics.protocol import NeedleLoad, State, TissueModel
 from echospline.picture import Frame, ImageFormer, frame_count, simulate
 from echospline.scenario.scenario import Scenario
 from echospline.scene import UltrasoundImage
@@ -42,24 +41,48 @@ class _Tally:
     largest: float = 0.0
     residual: float = 0.0
     folded: list[dict[str, Any]] = field(default_factory=list)
+    forces: dict[str, float] = field(default_factory=dict)
 
     def add(self, frame: Frame) -> None:
         for name, ms in frame.milliseconds.items():
             self.stages.setdefault(name, []).append(ms)
         self.largest = max(self.largest, float(np.hypot(*frame.displacement.T).max(initial=0.0)))
         self.residual = max(self.residual, frame.residual)
+        for name, value in _forces(frame.load).items():
+            self.forces[name] = max(self.forces.get(name, 0.0), abs(value))
         if frame.folds:
             self.folded.append({"time_s": round(frame.time, 6), "what": str(frame.folds)})
 
 
+def _forces(load: NeedleLoad | None) -> dict[str, float]:
+    """Return the needle's forces with their units in their names, as they are recorded."""
+    if load is None:
+        return {}
+    return {
+        "tip_force_N": load.tip,
+        "friction_N": load.friction,
+        "side_force_N": load.side,
+        "torque_N_mm": load.torque,
+        "cut_mm": load.cut,
+    }
+
+
 def _sink(
-    name: str, stack: ExitStack, out: Path, image: UltrasoundImage, fps: float
+    name: str,
+    stack: ExitStack,
+    out: Path,
+    image: UltrasoundImage,
+    fps: float,
+    window: tuple[float, float] | None,
 ) -> Callable[[Frame], None]:
     """Open the writer of one format."""
     if name in ("igs.mha", "seq.nrrd"):  # for PLUS and 3D Slicer: pictures with the needle's transforms
         recording = stack.enter_context(SequenceWriter(out / SUFFIX[name], image.grid))
         return lambda frame: recording.add(frame.image.pixels, frame.time, frame.pose)
-    cine = stack.enter_context(open_writer(out / SUFFIX[name], image.grid, fps))
+    narrow = name != "mha" and (window is not None)
+    cine = stack.enter_context(
+        open_writer(out / SUFFIX[name], image.grid, fps, window=window if narrow else None)
+    )
     return lambda frame: cine.add(frame.image.pixels, frame.time)
 
 
@@ -72,6 +95,7 @@ def run(
     *,
     progress: Callable[[int, int], None] | None = None,
     form_image: ImageFormer | None = None,
+    doubts: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Simulate a scenario and write its results.
 
@@ -91,6 +115,8 @@ def run(
         Called with (frames done, number of frames).
     form_image : callable, optional
         See `simulate`.
+    doubts : sequence of str
+        What was said before the run (see `prepared`); kept in the report.
 
     Returns
     -------
@@ -103,10 +129,8 @@ def run(
         If the folder cannot be written.
     """
     began = perf_counter()
-    try:
+    with writing(out):
         out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot make the folder {out} for the results: {error.strerror}") from error
     insertion, output = scenario.insertion(), scenario.output
     count = frame_count(insertion, output.fps)
     tally, files = _Tally(), []
@@ -117,7 +141,7 @@ def run(
         sinks = []
         for name in dict.fromkeys(output.formats):
             files.append(SUFFIX[name])
-            sinks.append(_sink(name, stack, out, image, output.fps))
+            sinks.append(_sink(name, stack, out, image, output.fps, output.window))
         record = None
         if output.displacement:
             files.append("displacement.npz")
@@ -138,7 +162,7 @@ def run(
             for sink in sinks:
                 sink(frame)
             if record is not None:
-                record.add(frame.displacement, frame.time, frame.pose)
+                record.add(frame.displacement, frame.time, frame.pose, _forces(frame.load))
             frame.milliseconds["write"] = 1000 * (perf_counter() - since)
             tally.add(frame)
             first = first or frame
@@ -174,8 +198,10 @@ def run(
         "mesh_nodes": model.grid.size,
         "frames": count,
         "largest_displacement_mm": tally.largest,
+        **({"largest_forces": tally.forces} if tally.forces else {}),
         "inverse_map_residual_px": tally.residual,
         "folded_frames": tally.folded,
+        "doubts": list(doubts),
         "milliseconds_per_frame": {
             name: {
                 "median": float(np.median(ms)),
@@ -190,9 +216,8 @@ def run(
         "core": describe_core(),
         "parameters": scenario.model_dump(mode="json"),
     }
-    part = part_of(out / "run.json")
-    part.write_text(json.dumps(report, indent=2), encoding="utf-8")
-    give_name(part, out / "run.json")
+    with appearing(out / "run.json") as part:
+        part.write_text(json.dumps(report, indent=2), encoding="utf-8")
     return report
 
 

@@ -12,17 +12,17 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import tomlkit
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError, model_validator
 
-from echospline.atomic import give_name, part_of
+from echospline.atomic import appearing
 from echospline.errors import InputError
-from echospline.io import read_image
 from echospline.picture import NeedleEcho
 from echospline.scenario.messages import describe as _describe
 from echospline.scenario.messages import sentence, shown
 from echospline.scenario.phantom_section import PhantomSection, ProbeSection
+from echospline.scenario.scale import PHANTOM, size_doubts
 from echospline.scenario.sections import (
+    VISCOUS,
     ExerciseSection,
     ImageSection,
     MeshSection,
@@ -46,7 +46,13 @@ from echospline.scene import (
     UltrasoundImage,
 )
 
-PHANTOM = "sample:phantom"
+FORMAT_1 = {
+    "mesh.sliding": [],
+    "model.kind": "tps",
+    "model.landmarks.loading": "follow",
+    "model.forces.law": "viscous",
+}
+"""What a file of format 1 means where it does not say."""
 LARGEST_FILE = 1_000_000
 """Bytes; a scenario is a page of text."""
 
@@ -57,17 +63,35 @@ class Scenario(Section):
     Read one with `load`, change it with `with_values`, write it with `save`.
     """
 
-    format: Literal[1] = Field(1, description="version of this file's layout")
+    format: Literal[2] = Field(2, description="version of this file's meaning; 1 is read as it was meant")
     title: str = Field("", description="one line for reports")
-    image: ImageSection = ImageSection()
-    tissue: TissueSection = TissueSection()
-    mesh: MeshSection = MeshSection()
+    image: ImageSection = Field(default_factory=ImageSection)
+    tissue: TissueSection = Field(default_factory=TissueSection)
+    mesh: MeshSection = Field(default_factory=MeshSection)
     needle: NeedleSection = Field(default_factory=NeedleSection)
-    model: ModelSection = ModelSection()
-    output: OutputSection = OutputSection()
-    probe: ProbeSection = ProbeSection()
-    phantom: PhantomSection = PhantomSection()
+    model: ModelSection = Field(default_factory=ModelSection)
+    output: OutputSection = Field(default_factory=OutputSection)
+    probe: ProbeSection = Field(default_factory=ProbeSection)
+    phantom: PhantomSection = Field(default_factory=PhantomSection)
     exercise: list[ExerciseSection] = Field(default=[], description="what can be trained live")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_format_1(cls, given: Any) -> Any:
+        """Fill in what a file of format 1 meant where it said nothing: a free top, landmarks that relax, viscous friction, the spline."""
+        if not isinstance(given, Mapping) or given.get("format") != 1:
+            return given
+        tree = {**given, "format": 2}
+        for key, meant in FORMAT_1.items():
+            *tables, last = key.split(".")
+            table = tree
+            for name in tables:
+                inner = table.get(name, {})
+                if not isinstance(inner, Mapping):
+                    return tree  # not a table: the fault is said by the fields
+                table[name] = table = dict(inner)
+            table.setdefault(last, meant)
+        return tree
 
     def with_values(self, values: Mapping[str, Any], origin: str = "scenario") -> Scenario:
         """Return a copy with some keys changed, ``{"needle.depth": 20}``, validated.
@@ -84,15 +108,38 @@ class Scenario(Section):
             for name in tables:
                 table = table[name]
             table[last] = value
+        mesh = tree["mesh"]
+        if (
+            "mesh.clamped" in values
+            and "mesh.sliding" not in values
+            and isinstance(mesh["clamped"], list | tuple)
+        ):
+            mesh["sliding"] = [edge for edge in mesh["sliding"] if edge not in mesh["clamped"]]  # clamped now
+        old = [key for key in values if key.startswith("model.forces.") and key.split(".")[-1] in VISCOUS]
+        if old and tree["model"]["forces"]["law"] == "stick-slip":
+            raise InputError(
+                f'{old[0]} belongs to the viscous law of forces; this scenario\'s model.forces.law is "stick-slip": set it to '
+                '"viscous" too, or set friction_limit'
+            )
         return validated(tree, origin)
 
     def read_image(self, folder: Path) -> UltrasoundImage:
-        """Read the image; a relative path starts at ``folder``; sample:phantom is [phantom] at rest."""
+        """Read the image; a relative path starts at ``folder``; sample:phantom is [phantom] at rest.
+
+        Raises
+        ------
+        InputError
+            If it cannot be read, or has a size that no ultrasound picture has.
+        """
         section = self.image
         if section.file == PHANTOM:
             return self.phantom.still(self.probe.probe())
+        from echospline.io import read_image  # noqa: PLC0415  (a wrong key is said before readers are loaded)
+
         name = section.file if section.file.startswith("sample:") else str(folder / section.file)
-        return read_image(name, spacing=section.spacing, frame=section.frame, region=section.region)
+        image = read_image(name, spacing=section.spacing, frame=section.frame, region=section.region)
+        size_doubts(image.grid)  # refuses what no scene can be, before anything is made of it
+        return image
 
     def grid(self, image: UltrasoundImage) -> RegularGrid:
         """Lay the mesh over the image."""
@@ -137,6 +184,8 @@ class Scenario(Section):
 
     def save(self, path: Path, folder: Path) -> None:
         """Write the scenario with a comment for every key; relative paths in ``folder`` stay valid from ``path``."""
+        import tomlkit  # noqa: PLC0415  (only runs are written; many scenarios are only read)
+
         document = tomlkit.document()
         document.add(
             tomlkit.comment("echospline scenario: run it with  echospline simulate THIS_FILE --out DIR")
@@ -145,10 +194,9 @@ class Scenario(Section):
         if not self.image.file.startswith("sample:"):
             image = os.path.relpath((folder / self.image.file).resolve(), path.parent.resolve())
             moved = self.model_copy(update={"image": self.image.model_copy(update={"file": image})})
-        _write_section(document, moved)
-        part = part_of(path)
-        part.write_text(tomlkit.dumps(document), encoding="utf-8")
-        give_name(part, path)
+        _write_section(tomlkit, document, moved)
+        with appearing(path) as part:
+            part.write_text(tomlkit.dumps(document), encoding="utf-8")
 
 
 def load(path: str | Path) -> Scenario:
@@ -228,6 +276,8 @@ def _shape(region: RegionSection, folder: Path, mesh: RegularGrid, key: str) -> 
         return Polygon(tuple(region.polygon))
     if region.labels is None:
         raise InputError(f"{key} says nothing of where it is")
+    from echospline.io import read_image  # noqa: PLC0415  (as above)
+
     path = folder / region.labels.file
     labels = read_image(str(path), spacing=(1.0, 1.0)).pixels
     if labels.ndim != 2 or not np.issubdtype(labels.dtype, np.integer):
@@ -236,7 +286,7 @@ def _shape(region: RegionSection, folder: Path, mesh: RegularGrid, key: str) -> 
     return Label(labels.astype(np.int64), RegularGrid.covering(mesh, shape), region.labels.value)
 
 
-def _write_section(table: Any, section: BaseModel) -> None:
+def _write_section(toml: Any, table: Any, section: BaseModel) -> None:
     """Add every key of a section with its description as a comment; sections inside come after plain keys."""
     inner: list[tuple[str, Any]] = []
     for name, field in type(section).model_fields.items():
@@ -248,21 +298,21 @@ def _write_section(table: Any, section: BaseModel) -> None:
         ):
             inner.append((name, value))
         else:
-            item = tomlkit.item(_as_toml(value))
+            item = toml.item(_as_toml(value))
             if field.description:
                 item.comment(field.description)
             table.add(name, item)
     for name, value in inner:
         if isinstance(value, BaseModel):
-            sub = tomlkit.table()
-            _write_section(sub, value)
-            table.add(tomlkit.nl())
+            sub = toml.table()
+            _write_section(toml, sub, value)
+            table.add(toml.nl())
             table.add(name, sub)
         else:
-            rows = tomlkit.aot()
+            rows = toml.aot()
             for row in value:
-                sub = tomlkit.table()
-                _write_section(sub, row)
+                sub = toml.table()
+                _write_section(toml, sub, row)
                 rows.append(sub)
             table.add(name, rows)
 

@@ -37,6 +37,8 @@ Speed = Annotated[float, _in_unit("mm/s")]
 Rate = Annotated[float, _in_unit("1/s")]
 Newtons = Annotated[float, _in_unit("N")]
 Friction = Annotated[float, _in_unit("N s/mm^2")]
+PerLength = Annotated[float, _in_unit("N/mm")]
+PerArea = Annotated[float, _in_unit("N/mm^2")]
 Kilopascals = Annotated[float, _in_unit("kPa")]
 Point = tuple[Millimetres, Millimetres]
 
@@ -44,7 +46,7 @@ Point = tuple[Millimetres, Millimetres]
 class Section(BaseModel):
     """A table of the file: unknown keys are refused, infinite and NaN numbers too."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
 
 
 class ImageSection(Section):
@@ -96,6 +98,9 @@ class TissueSection(Section):
     poisson: float = Field(0.45, ge=0, le=0.5, description="Poisson's ratio of the background")
     thickness: Millimetres = Field(40.0, gt=0, description="across the imaging plane, mm")
     plane: Literal["stress", "strain"] = Field("stress", description="plane stress (19) or plane strain")
+    material: Literal["linear", "neo-hookean"] = Field(
+        "linear", description="linear elasticity, or neo-hookean for large deformation (fem alone, offline)"
+    )
     region: list[RegionSection] = Field(
         default=[], description="layers, lesions; each on top of those before"
     )
@@ -105,12 +110,30 @@ class MeshSection(Section):
     """The mesh over the image and its clamped edges."""
 
     nodes: tuple[Annotated[int, Field(ge=2, le=4096)], Annotated[int, Field(ge=2, le=4096)]] = Field(
-        (40, 30), description="nodes along x and y, corner to corner over the image"
+        (40, 30),
+        description="nodes along x and y, corner to corner over the image",
+        json_schema_extra={"between": "x"},  # as the command line takes it: 40x30
     )
     clamped: list[Literal["top", "bottom", "left", "right"]] = Field(
         ["left", "right", "bottom"], description="edges held fast; top is the probe's face"
     )
+    sliding: list[Literal["top", "bottom", "left", "right"]] = Field(
+        ["top"],
+        description="edges that move along themselves alone: the skin under the probe; any other edge is free",
+    )
     clamped_points: list[Point] = Field(default=[], description="further points held fast, mm")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _clamped_top_does_not_slide(cls, given: Any) -> Any:
+        """Let a clamped edge not slide, where nothing is said of sliding edges."""
+        if (
+            isinstance(given, dict)
+            and "sliding" not in given
+            and isinstance(given.get("clamped"), list | tuple)
+        ):
+            return {**given, "sliding": [edge for edge in ("top",) if edge not in given["clamped"]]}
+        return given
 
 
 def _look(name: str, description: str) -> Any:
@@ -202,13 +225,24 @@ class LandmarkSection(Section):
         1.0, ge=0, le=1, description="sideways motion that tissue follows, 0 (paper) to 1 (bonded)"
     )
     tip: Literal["point", "node"] = Field("point", description="landmark at the tip, or nearest node (paper)")
-    loading: Literal["follow", "immediate"] = Field(
-        "follow", description="friction grows with the needle's motion, or at once (paper)"
+    loading: Literal["stick", "follow", "immediate"] = Field(
+        "stick",
+        description="tissue sticks to the shaft and slips, or follows friction and relaxes at rest (paper's (16), (17)), or has it "
+        "at once (paper)",
+    )
+    friction_speed: Speed = Field(
+        10.0,
+        ge=0,
+        le=1e3,
+        description="speed at which (15) says how far friction holds tissue that sticks, mm/s",
     )
     contact_spacing: Millimetres = Field(
         1.25, ge=0, le=50, description="between contacts, mm; 0 takes every node"
     )
-    anchor_spacing: Millimetres = Field(1.5, gt=0, le=50, description="between anchors on clamped edges, mm")
+    anchor_spacing: Annotated[Millimetres, Field(gt=0, le=50)] | None = Field(
+        None,
+        description="between anchors on held edges, mm; 1.5 where not given, 1 for elastic beside an edge that slides",
+    )
 
 
 class ElasticSection(Section):
@@ -221,32 +255,90 @@ class ElasticSection(Section):
 
 
 class GreenSection(Section):
-    """Green's function of tissue under a free surface."""
+    """Green's function: how the tissue answers forces."""
 
     radius: Millimetres = Field(0.4, gt=0, le=50, description="length over which a force is spread, mm")
+    method: Literal["auto", "boundary", "regions", "solve"] = Field(
+        "auto",
+        description="closed forms (homogeneous; layers and lesions), a live solve, or the first that is good",
+    )
 
 
 class ForceSection(Section):
-    """The needle's forces for fem and green."""
+    """The needle's forces for fem and green: a law that sticks and slips, or the paper's viscous one."""
 
-    tip: Newtons = Field(0.4, ge=0, le=100, description="cutting force at the tip, N")
+    law: Literal["stick-slip", "viscous"] = Field(
+        "stick-slip",
+        description="stick-slip (sticks, slips, cuts) or viscous (paper), which reads tip, friction, alpha3 and ramp alone",
+    )
+    tip: Newtons = Field(0.4, ge=0, le=100, description="cutting force at the tip, N (paper)")
+    friction_limit: PerLength = Field(
+        0.01,
+        ge=0,
+        le=10,
+        description="greatest friction per mm of shaft, N/mm; 0.005 to 0.02 are plausible (assumed)",
+    )
+    bond: PerArea = Field(
+        0.1, gt=0, le=1e3, description="stiffness between shaft and tissue per mm, N/mm^2 (assumed)"
+    )
+    tip_stiffness: PerLength = Field(
+        2.0, gt=0, le=1e3, description="stiffness of the tip's contact, N/mm (assumed)"
+    )
+    side_stiffness: PerArea = Field(
+        1.0, gt=0, le=1e3, description="stiffness across the shaft per mm, N/mm^2 (assumed)"
+    )
+    viscosity: Friction = Field(
+        0.0,
+        ge=0,
+        le=10,
+        description="friction beyond its limit per mm and mm/s of slip, N s/mm^2; 5e-4 shows speed (assumed)",
+    )
+    station_spacing: Millimetres = Field(
+        1.25, ge=0.05, le=50, description="between the points of the track that carry forces, mm"
+    )
+    substep: Millimetres = Field(
+        0.25, ge=0.001, le=50, description="longest travel that is solved at once, mm"
+    )
+    dead_band: Millimetres = Field(
+        0.0,
+        ge=0,
+        le=10,
+        description="play in the depth to either side, mm; 0.15 suits a tracker with 0.05 mm of noise",
+    )
     friction: Friction = Field(
-        1e-3, ge=0, le=10, description="friction per mm of shaft and mm/s of speed, N s/mm^2 (paper: 1e-8)"
+        1e-3,
+        ge=0,
+        le=10,
+        description="viscous: friction per mm of shaft and mm/s of speed, N s/mm^2 (paper: 1e-8)",
     )
-    alpha3: Rate = Field(1.0, ge=0, le=1e3, description="relaxation (16), 1/s")
+    alpha3: Rate = Field(1.0, ge=0, le=1e3, description="viscous: relaxation (16), 1/s")
     ramp: Millimetres = Field(
-        1.0, ge=0, le=100, description="travel over which forces build up, mm; 0 at once"
+        1.0, ge=0, le=100, description="viscous: travel over which forces build up, mm; 0 at once"
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_old_files(cls, given: Any) -> Any:
+        """Numbers of the viscous law without a law: a file from before there were two."""
+        if isinstance(given, dict) and "law" not in given and VISCOUS.intersection(given):
+            return {**given, "law": "viscous"}
+        return given
+
+
+VISCOUS = frozenset({"friction", "alpha3", "ramp"})
+"""Keys of [model.forces] that the viscous law alone reads."""
 
 
 class ModelSection(Section):
     """The tissue model."""
 
-    kind: Literal["tps", "elastic", "green", "fem"] = Field("tps", description="tps, elastic, green or fem")
-    landmarks: LandmarkSection = LandmarkSection()
-    elastic: ElasticSection = ElasticSection()
-    green: GreenSection = GreenSection()
-    forces: ForceSection = ForceSection()
+    kind: Literal["tps", "elastic", "green", "fem"] = Field(
+        "green", description="green, tps (paper), elastic or fem"
+    )
+    landmarks: LandmarkSection = Field(default_factory=LandmarkSection)
+    elastic: ElasticSection = Field(default_factory=ElasticSection)
+    green: GreenSection = Field(default_factory=GreenSection)
+    forces: ForceSection = Field(default_factory=ForceSection)
 
 
 class OutputSection(Section):
@@ -262,6 +354,10 @@ class OutputSection(Section):
     needle: bool = Field(True, description="draw the needle's echo")
     border: Annotated[float, Field(ge=0)] | Literal["transparent"] = Field(
         0.0, description="value where no tissue comes to lie"
+    )
+    window: tuple[float, float] | None = Field(
+        None,
+        description="pixel values shown as black and white where a format holds 8 bits; chosen where needed and not given",
     )
     folding: Literal["flag", "refuse"] = Field("flag", description="what happens when the picture folds")
     inverse: Literal["auto", "exact"] = Field(

@@ -8,7 +8,6 @@ from math import isfinite, pi
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, signal
 
 from echospline.errors import InputError
 from echospline.scene.grid import Floats, RegularGrid
@@ -100,6 +99,8 @@ class Echo:
                 f"a carrier of {carrier:g} cycles/mm needs RF samples closer than {0.5 / carrier:.4f} mm in depth; "
                 f"got {grid.spacing[1]:g} mm"
             )
+        from scipy import signal  # noqa: PLC0415  (SciPy's signals take longer to load than all else)
+
         analytic = signal.hilbert(np.asarray(rf, dtype=np.float32), axis=0)
         turn = np.exp(-2j * pi * carrier * grid.y).astype(np.complex64)
         return cls(analytic * turn[:, None], grid, carrier)
@@ -113,6 +114,8 @@ class Echo:
             )
         (lines, rows), (dx, dy), (x0, y0) = self.grid.shape, self.grid.spacing, self.grid.origin
         factor = int(np.ceil(dy / spacing))
+        from scipy import signal  # noqa: PLC0415  (as above)
+
         fine = signal.resample(self.iq, rows * factor, axis=0)[: (rows - 1) * factor + 1]
         n = int(np.floor((rows - 1) * dy / spacing)) + 1
         out = RegularGrid((lines, n), (dx, spacing), (x0, y0))
@@ -164,12 +167,16 @@ class EchoCine:
 
 def band_limited(iq: Complexes, factor: int, axis: int = 0) -> Complexes:
     """Refine samples ``factor`` times along an axis by zero-padding their spectrum."""
-    return np.asarray(signal.resample(iq, iq.shape[axis] * factor, axis=axis)) if factor > 1 else iq
+    if factor <= 1:
+        return iq
+    from scipy import signal  # noqa: PLC0415  (as above)
+
+    return np.asarray(signal.resample(iq, iq.shape[axis] * factor, axis=axis))
 
 
 def fourier_frequencies(n: int, spacing: float) -> Floats:
     """Return the frequencies of an n-point transform in cycles per mm."""
-    return np.asarray(fft.fftfreq(n, spacing), dtype=np.float64)
+    return np.asarray(np.fft.fftfreq(n, spacing), dtype=np.float64)
 
 
 def _sub_lattice(fine: RegularGrid, coarse: RegularGrid) -> tuple[slice, slice]:

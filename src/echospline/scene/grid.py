@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from echospline.errors import InputError
+from echospline.scene.number import is_number
 
 Floats = NDArray[np.float64]
 Edge = Literal["top", "bottom", "left", "right"]
@@ -38,7 +39,10 @@ def as_points(points: ArrayLike, name: str = "points", dimension: int = 2) -> Fl
     InputError
         If the shape is another or a coordinate is not finite.
     """
-    array = np.atleast_2d(np.asarray(points, dtype=np.float64))
+    try:
+        array = np.atleast_2d(np.asarray(points, dtype=np.float64))
+    except (TypeError, ValueError):
+        raise InputError(f"{name} must be numbers in mm; got {points!r}") from None
     if array.ndim != 2 or array.shape[1] != dimension:
         axes = "x lateral, y depth" + (", z elevation" if dimension == 3 else "")
         raise InputError(f"{name} must have shape (n, {dimension}), ({axes}) in mm; got {np.shape(points)}")
@@ -72,13 +76,13 @@ class RegularGrid:
     origin: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if len(self.shape) != 2 or not all(int(n) == n and n >= 1 for n in self.shape):
+        if len(self.shape) != 2 or not all(is_number(n) and int(n) == n and n >= 1 for n in self.shape):
             raise InputError(f"shape must be two positive integers (nx, ny); got {self.shape}")
-        if len(self.spacing) != 2 or not all(np.isfinite(h) and h > 0 for h in self.spacing):
+        if len(self.spacing) != 2 or not all(is_number(h) and h > 0 for h in self.spacing):
             raise InputError(
                 f"spacing must be two positive numbers in mm (lateral, depth); got {self.spacing}"
             )
-        if len(self.origin) != 2 or not all(np.isfinite(c) for c in self.origin):
+        if len(self.origin) != 2 or not all(is_number(c) for c in self.origin):
             raise InputError(f"origin must be two finite numbers in mm (x, y); got {self.origin}")
         object.__setattr__(self, "shape", (int(self.shape[0]), int(self.shape[1])))
         object.__setattr__(self, "spacing", (float(self.spacing[0]), float(self.spacing[1])))
@@ -87,7 +91,7 @@ class RegularGrid:
     @classmethod
     def covering(cls, other: RegularGrid, shape: tuple[int, int]) -> RegularGrid:
         """Return the grid of ``shape`` (nx, ny) whose corner points are those of ``other`` (a mesh over an image)."""
-        if len(shape) != 2 or not all(int(n) == n and n >= 2 for n in shape):
+        if len(shape) != 2 or not all(is_number(n) and int(n) == n and n >= 2 for n in shape):
             raise InputError(f"a mesh needs at least 2 x 2 nodes (NXxNY); got {shape}")
         x0, x1, y0, y1 = other.extent
         if x1 <= x0 or y1 <= y0:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import cos, hypot, isfinite, radians, sin
+from math import cos, hypot, radians, sin
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from echospline.errors import InputError
 from echospline.scene.grid import Floats, as_points
+from echospline.scene.number import is_number
 
 SAME_TIME = 1e-9
 """s; times closer than this are equal, so that k / fps and a keyframe agree in spite of rounding."""
@@ -45,7 +46,7 @@ class NeedlePose:
         if len(self.entry) != 2 or len(self.tip) != 2:
             raise InputError(f"entry and tip must be (x, y) in mm; got {self.entry} and {self.tip}")
         values = (*self.entry, *self.tip, self.speed)
-        if not all(isfinite(v) for v in values):
+        if not all(is_number(v) for v in values):
             raise InputError(
                 f"a needle pose must be finite: entry {self.entry} mm, tip {self.tip} mm, speed {self.speed} mm/s"
             )
@@ -174,11 +175,11 @@ class Insertion:
             ("speed", speed, "mm/s"),
             ("retract_speed", back, "mm/s"),
         ):
-            if not (isfinite(value) and value > 0):
+            if not (is_number(value) and value > 0):
                 raise InputError(f"{name} must be a positive number in {unit}; got {value}")
-        if not (isfinite(dwell) and dwell >= 0):
+        if not (is_number(dwell) and dwell >= 0):
             raise InputError(f"dwell must be zero or a positive number in s; got {dwell}")
-        if not isfinite(angle):
+        if not is_number(angle):
             raise InputError(f"angle must be a finite number in degrees; got {angle}")
         ns = as_points(entry, "entry")[0]
         nt = ns + depth * np.array([cos(radians(angle)), sin(radians(angle))])

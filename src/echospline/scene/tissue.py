@@ -173,20 +173,30 @@ class Tissue:
     def in_cells(self, grid: RegularGrid, samples: int = 4) -> tuple[Floats, Floats]:
         """Return Young's modulus (kPa) and Poisson's ratio per mesh cell, x fastest, each of shape ((nx-1) (ny-1),).
 
-        A cell that a boundary crosses gets the mean over ``samples`` x ``samples`` points, so that a round lesion
-        does not turn into a staircase of whole cells.
+        A cell that a boundary crosses gets the mean compliance over ``samples`` x ``samples`` points: the harmonic mean of
+        the moduli, the least stiffness that the cell can have (Reuss). `mechanics.cut_cells` adds what it has beyond that.
         """
-        nx, ny = grid.shape
+        cells = (grid.shape[0] - 1) * (grid.shape[1] - 1)
         if self.homogeneous:
-            n = (nx - 1) * (ny - 1)
-            return np.full(n, float(self.young)), np.full(n, float(self.poisson))
-        steps = [(np.arange((n - 1) * samples) + 0.5) / samples for n in (nx, ny)]
-        points = grid.to_mm(np.stack(np.meshgrid(*steps), axis=-1).reshape(-1, 2))
-        young, poisson = (
-            values.reshape(ny - 1, samples, nx - 1, samples).mean(axis=(1, 3)).ravel()
-            for values in self.at(points)
+            return np.full(cells, float(self.young)), np.full(cells, float(self.poisson))
+        young, poisson = self.sampled(grid, np.arange(cells), samples)
+        E = 1.0 / (1.0 / young).mean(axis=1)
+        whole = (young == young[:, :1]).all(axis=1)
+        return np.where(whole, young[:, 0], E), np.where(
+            (poisson == poisson[:, :1]).all(axis=1), poisson[:, 0], E * (poisson / young).mean(axis=1)
         )
-        return young, poisson
+
+    def sampled(self, grid: RegularGrid, cells: NDArray[np.intp], samples: int) -> tuple[Floats, Floats]:
+        """Return Young's modulus (kPa) and Poisson's ratio at ``samples`` x ``samples`` points of some cells.
+
+        The points are the middles of equal parts of a cell, x fastest; each result has shape (cells, samples^2).
+        """
+        part = (np.arange(samples) + 0.5) / samples
+        within = np.stack(np.meshgrid(part, part), axis=-1).reshape(-1, 2)
+        first = np.stack(np.divmod(cells, grid.shape[0] - 1)[::-1], axis=-1)
+        young, poisson = self.at(grid.to_mm((first[:, None] + within).reshape(-1, 2)))
+        shape = (len(cells), samples**2)
+        return young.reshape(shape), poisson.reshape(shape)
 
 
 def _check(young: float, poisson: float, owner: str) -> None:

@@ -38,23 +38,32 @@ def transform_between(transforms: Mapping[str, Floats], source: str, target: str
     source, target : str
         Names of frames.
     """
-    steps: dict[str, list[tuple[str, Floats, bool]]] = {}
+    found = chain_between(transforms, source, target)
+    return None if found is None else found[0]
+
+
+def chain_between(
+    transforms: Mapping[str, Floats], source: str, target: str
+) -> tuple[Floats, tuple[str, ...]] | None:
+    """Return what `transform_between` returns, and the names of the transforms on the way."""
+    steps: dict[str, list[tuple[str, str, Floats, bool]]] = {}
     for name, matrix in transforms.items():
         start, end = frames_of(name)
-        steps.setdefault(start, []).append((end, matrix, False))
-        steps.setdefault(end, []).append((start, matrix, True))
-    found = {source: np.eye(4)}
+        steps.setdefault(start, []).append((name, end, matrix, False))
+        steps.setdefault(end, []).append((name, start, matrix, True))
+    found: dict[str, tuple[Floats, tuple[str, ...]]] = {source: (np.eye(4), ())}
     queue = deque([source])
     while queue:
         frame = queue.popleft()
         if frame == target:
             return found[frame]
-        for other, matrix, inverse in steps.get(frame, ()):
+        before, names = found[frame]
+        for name, other, matrix, inverse in steps.get(frame, ()):
             if other in found:
                 continue
             if inverse and abs(np.linalg.det(matrix[:3, :3])) < 1e-12:
                 continue  # a singular transform cannot be inverted
-            found[other] = (np.linalg.inv(matrix) if inverse else matrix) @ found[frame]
+            found[other] = (np.linalg.inv(matrix) if inverse else matrix) @ before, (*names, name)
             queue.append(other)
     return None
 

@@ -19,11 +19,11 @@ from echospline.mechanics import (
     FEMModel,
     GreenModel,
     Kernel,
-    NeedleForces,
     Solver,
     ThinPlate,
     TPSModel,
     TPSParameters,
+    ViscousForces,
     landmark_stiffness,
 )
 from echospline.mechanics.protocol import TissueModel
@@ -104,9 +104,9 @@ class Case:
         return Tissue(self.young, regions=[Region(Circle((x, y), radius), young)])
 
     @property
-    def forces(self) -> NeedleForces:
+    def forces(self) -> ViscousForces:
         """The paper's forces, at once."""
-        return NeedleForces(0.4, self.friction, ramp=0.0)
+        return ViscousForces(0.4, self.friction, ramp=0.0)
 
     def poses(self, trajectory: tuple[tuple[float, float], float, float]) -> tuple[Floats, list[NeedlePose]]:
         """Return the times (s) and poses of a trajectory: rest, then ``steps`` equal depths."""
@@ -234,7 +234,7 @@ def oracle(grid: RegularGrid, seen: Observation, kernel: Kernel) -> Floats:
 
     No law of interaction can do better with these landmarks: the remaining error is the kernel's own.
     """
-    anchors = TPSModel(grid, CLAMPED, PRINTED, kernel).anchors
+    anchors = TPSModel(grid, CLAMPED, PRINTED, kernel).anchors.places
     inside = np.setdiff1d(np.arange(grid.size), grid.boundary(CLAMPED))
     fields = []
     for pose, u in zip(seen.poses, seen.displacement, strict=True):

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from echospline.atomic import give_name, part_of, writing
+from echospline.atomic import appearing, claimed
 from echospline.errors import InputError
 from echospline.io import read_needle
 from echospline.mechanics import FEMModel, GreenModel, TPSModel
@@ -26,6 +26,7 @@ PRINTED: Mapping[str, Any] = {
     "model.landmarks.loading": "immediate",
     "model.landmarks.drag": 0.0,
     "model.landmarks.tip": "point",
+    "model.forces.law": "viscous",
     "model.forces.ramp": 0.0,
 }
 """The laws under which fields are linear in the parameters."""
@@ -85,7 +86,38 @@ def calibrate(
     InputError
         If a file or an option is invalid.
     """
-    path = Path(field)
+    with claimed(Path(out)):
+        return _calibrated(
+            Path(field),
+            Path(out),
+            scenario,
+            model,
+            objective,
+            method,
+            needle,
+            confidence,
+            frames,
+            runs,
+            bootstrap,
+            seed,
+        )
+
+
+def _calibrated(
+    path: Path,
+    folder: Path,
+    scenario: str | None,
+    model: str | None,
+    objective: Objective,
+    method: str,
+    needle: str | None,
+    confidence: float,
+    frames: int,
+    runs: int,
+    bootstrap: int,
+    seed: int,
+) -> dict[str, Any]:
+    """Do it in a folder that is held."""
     path = path / "displacement.npz" if path.is_dir() else path
     beside = path.parent / "scenario.toml"
     if scenario is None and not beside.exists():
@@ -116,16 +148,11 @@ def calibrate(
         )
     keys = {name: f"model.{_table(kind)}.{name}" for name in found.values}
     result = scene.with_values({keys[n]: v for n, v in found.values.items()}, "identified parameters")
-    folder = Path(out)
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
     result.save(folder / "identified.toml", source.parent)
     error_map(seen.points, found.error_map, folder / "error_map", f"{kind} identified: {path.name}")
     report = _report(kind, objective, path, seen, found)
-    with writing(folder / "identification.json"):
-        part = part_of(folder / "identification.json")
+    with appearing(folder / "identification.json") as part:
         part.write_text(json.dumps(report, indent=1, allow_nan=False), encoding="utf-8")
-        give_name(part, folder / "identification.json")
     return report
 
 
@@ -147,7 +174,9 @@ def _observation(path: Path, needle: str | None, confidence: float) -> Observati
 
 def _forces(built: Any) -> FEMModel | GreenModel:
     if not isinstance(built, FEMModel | GreenModel):
-        raise InputError(f"{type(built).__name__} has no forces to identify")
+        raise InputError(
+            f"forces are identified where the field is linear in them; {type(built).__name__} is not: set tissue.material = 'linear'"
+        )
     return built
 
 

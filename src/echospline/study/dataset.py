@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from echospline.atomic import give_name, part_of, writing
+from echospline.atomic import appearing, writing
 from echospline.errors import InputError, MissingExtraError
 from echospline.laboratory import phantom_pictures
 from echospline.picture import OUTER_DIAMETER, simulate
@@ -91,12 +91,13 @@ def drawn(base: Scenario, index: int, seed: int, frames: int, variation: Variati
         centre = rng.uniform((0.1 * width, 0.1 * height), (0.9 * width, 0.9 * height))
         level = -100.0 if rng.random() < 0.3 else float(rng.uniform(-12.0, 9.0))
         regions.append({"level": level, "ellipse": {"centre": centre.tolist(), "half_axes": half.tolist()}})
+    limit = "friction" if base.model.forces.law == "viscous" else "friction_limit"
     values: dict[str, Any] = {
         "title": f"sample {index}, seed {seed}",
         "image.file": PHANTOM,
         "tissue.young": base.tissue.young * factor(v.young),
         "model.forces.tip": base.model.forces.tip * factor(v.tip_force),
-        "model.forces.friction": base.model.forces.friction * factor(v.friction),
+        f"model.forces.{limit}": getattr(base.model.forces, limit) * factor(v.friction),
         "probe.frequency": base.probe.frequency * factor(v.frequency),
         "probe.snr": float(rng.uniform(*v.snr)),
         "probe.attenuation": float(rng.uniform(*v.attenuation)),
@@ -233,10 +234,8 @@ def needle_mask(
 def write_summary(path: Path, summary: Mapping[str, Any]) -> None:
     """Write ``dataset.json`` beside the arrays."""
     file = path / "dataset.json"
-    with writing(file):
-        part = part_of(file)
+    with appearing(file) as part:
         part.write_text(json.dumps(summary, indent=1), encoding="utf-8")
-        give_name(part, file)
 
 
 def _zarr() -> Any:

@@ -216,7 +216,7 @@ class _Problem:
 
     def __init__(self, fields: UnitFields) -> None:
         self.fields = fields
-        self.bounds = np.array(list(fields.linear.values()))
+        self.rows, self.low = fields.least
         observed = fields.observation.displacement
         size = distance(observed, np.zeros_like(observed))
         self.seen = size > MOVED
@@ -255,20 +255,29 @@ class _Problem:
         weight: Floats | None = None,
         tolerance: float = 1e-6,
     ) -> Floats:
-        """Minimise sum |A x - b| (mae) or its squares (rmse) with lower bounds on x."""
+        """Minimise sum |A x - b| (mae) or its squares (rmse) with lower bounds on combinations of x.
+
+        The problem is convex: where the free minimum breaks a bound, the answer is the best of the minima on the faces that
+        the bounds have, among those that break none. There are few bounds, so all faces are tried.
+        """
         w = np.ones(len(b)) if weight is None else weight
-        held = np.zeros(A.shape[-1], dtype=bool)
-        x = np.where(held, self.bounds, 0.0)
-        for _ in range(A.shape[-1] + 1):
-            x = np.where(held, np.where(np.isfinite(self.bounds), self.bounds, 0.0), 0.0)
-            if held.all():
-                return x
-            rest = b - A[..., held] @ x[held]
-            x[~held] = _least(A[..., ~held], rest, w, objective, 1e-6 * self.scale, tolerance)
-            below = ~held & (x < self.bounds)
-            if not below.any():
-                return x
-            held |= below
+        floor = 1e-6 * self.scale
+        x = _least(A, b, w, objective, floor, tolerance)
+        if (self.rows @ x >= self.low).all():
+            return x
+        back = np.linalg.inv(self.rows)
+        B = A @ back  # the unknowns y = rows x have the bounds themselves
+        found: list[tuple[float, Floats]] = []
+        for face in product((False, True), repeat=len(self.low)):
+            held = np.array(face)
+            y = self.low.copy()
+            if not held.all():
+                rest = b - B[..., held] @ y[held]
+                y[~held] = _least(B[..., ~held], rest, w, objective, floor, tolerance)
+            if held.any() and (y >= self.low).all():
+                epsilon = np.hypot(*(B @ y - b).T)
+                found.append((float(w @ (epsilon if objective == "mae" else epsilon**2)), y))
+        x = back @ min(found, key=lambda end: end[0])[1]
         return x
 
     def confounded(self, A: Floats, values: Mapping[str, float]) -> tuple[float, tuple[str, ...]]:

@@ -8,7 +8,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from echospline.atomic import give_name, part_of, writing
+from echospline.atomic import appearing
 
 Cell = str | int | float | bool | None
 _KINDS = {".png": "image/png", ".svg": "image/svg+xml"}
@@ -70,10 +70,8 @@ def write_report(path: Path, title: str, sections: Sequence[tuple[str, Sequence[
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{escape(title)}</title><style>{_STYLE}</style></head><body><h1>{escape(title)}</h1>{body}</body></html>\n"
     )
-    with writing(path):
-        part = part_of(path)
+    with appearing(path) as part:
         part.write_text(page, encoding="utf-8")
-        give_name(part, path)
 
 
 def _cell(value: Cell) -> str:

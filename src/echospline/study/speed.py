@@ -21,11 +21,11 @@ from echospline.mechanics import (
     FEMModel,
     GreenModel,
     Kernel,
-    NeedleForces,
     Solver,
     ThinPlate,
     TPSModel,
     TPSParameters,
+    ViscousForces,
 )
 from echospline.mechanics.finite_elements import Method as Factorisation
 from echospline.mechanics.finite_elements import factor, stiffness
@@ -37,7 +37,7 @@ from echospline.study.accuracy import CLAMPED, FITTED, SIZE, SPEED
 Step = Callable[[NeedlePose], Floats]
 Build = Callable[[RegularGrid, Sequence[NeedlePose]], Step]
 
-FORCES = NeedleForces(0.4, 1e-8, ramp=0.0)
+FORCES = ViscousForces(0.4, 1e-8, ramp=0.0)
 LANDMARKS = TPSParameters(loading="immediate", drag=0.0, tip="point")
 """Landmarks represent tissue, not pixels: they are about 1.25 mm apart on every mesh."""
 

@@ -15,7 +15,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from echospline.atomic import give_name, part_of, writing
+from echospline.atomic import appearing, writing
 from echospline.errors import EchosplineError, InputError, MissingExtraError
 
 Result = dict[str, Any]
@@ -187,10 +187,8 @@ def _client(distributed: Any, workers: int, scheduler: str | None) -> Iterator[A
 def _keep(task: Task, result: Result, out: Path) -> Result:
     path = out / f"{task.name}.json"
     whole = {"task": task.name, "arguments": task.arguments, "result": result}
-    with writing(path):
-        part = part_of(path)
+    with appearing(path) as part:
         part.write_text(json.dumps(whole, indent=1, allow_nan=False), encoding="utf-8")
-        give_name(part, path)
     kept: Result = json.loads(json.dumps(result))
     return kept
 

@@ -92,8 +92,13 @@ class UnitFields(Protocol):
         ...
 
     @property
-    def linear(self) -> Mapping[str, float]:
-        """Parameters in which the field is linear, with their lower bounds."""
+    def linear(self) -> Sequence[str]:
+        """Parameters in which the field is linear, p names."""
+        ...
+
+    @property
+    def least(self) -> tuple[Floats, Floats]:
+        """Combinations of the linear parameters that have lower bounds, an invertible (p, p), and those bounds, (p,)."""
         ...
 
     @property
@@ -169,10 +174,17 @@ class SplineFields:
                 f"got {p.loading!r}, {p.drag} and {p.tip!r}"
             )
         self.model, self.observation = model, observation
-        self.linear: dict[str, float] = {"alpha1": -np.inf, "alpha2": -np.inf, "sigma": 1e-3}
+        self.linear = ("alpha1", "alpha2", "sigma")
+        # friction, equation (15), lies between alpha1 far from the shaft and alpha1 + alpha2 / 2 at it: neither is negative
+        self.least = (
+            np.array([[1.0, 0.0, 0.0], [1.0, 0.5, 0.0], [0.0, 0.0, 1.0]]),
+            np.array([0.0, 0.0, 1e-3]),
+        )
         self.search = {"length": length} | ({"alpha3": alpha3} if observation.rests else {})
         self.levels = {"delta": tuple(delta)}
-        self._scene = AnchoredKernel.factor(model.kernel, model.anchors, observation.points)
+        self._scene = AnchoredKernel.factor(
+            model.kernel, model.anchors.places, observation.points, held=model.anchors.held
+        )
         nodes = model.grid.nodes[model.lattice]
         reach = [
             pose.closest(nodes)[1] <= max(delta) for pose in observation.poses if pose.depth >= ZERO_LENGTH
@@ -204,7 +216,7 @@ class SplineFields:
         along[:m, 1] = friction(frame.distance, speed, 0.0, 1.0, values["length"])
         if frame.tip is not None:
             sigma = values.get("sigma", 1.0)
-            along[m, 2] = tip_push(frame.pose, sigma, self.model.clamps.clearance(frame.pose.tip)) / sigma
+            along[m, 2] = tip_push(frame.pose, sigma, self._clearance(frame.pose)) / sigma
         axis = np.array(frame.pose.axis)
         if c == 2:
             along = np.repeat(along, 2, axis=0) * np.tile(axis, len(along))[:, None]
@@ -216,9 +228,13 @@ class SplineFields:
             return np.asarray(field[:, None, :] * axis[:, None])
         return np.asarray(field.reshape(2, -1, 3).transpose(1, 0, 2))
 
+    def _clearance(self, pose: NeedlePose) -> float:
+        """Distance over which the tip can push, mm."""
+        return self.model.clamps.clearance(pose.tip, pose.axis)
+
     def _tip(self, pose: NeedlePose, candidates: Floats) -> _Tip | None:
         """Return the tip's responses; None where it pushes nothing."""
-        if pose.speed < 0 or pose.depth < ZERO_LENGTH or self.model.clamps.clearance(pose.tip) <= 0:
+        if pose.speed < 0 or pose.depth < ZERO_LENGTH or self._clearance(pose) <= 0:
             return None
         place = np.array([pose.tip])
         x = self._scene.conditioned(place)
@@ -268,7 +284,8 @@ class ForceFields:
         alpha3: tuple[float, float] = (0.01, 20.0),
     ) -> None:
         self.model, self.observation = model, observation
-        self.linear: dict[str, float] = {"tip": 0.0, "friction": 0.0}
+        self.linear = ("tip", "friction")
+        self.least = (np.eye(2), np.zeros(2))
         self.search = {"alpha3": alpha3} if observation.rests else {}
         self.levels: dict[str, tuple[float, ...]] = {}
         unit = [self._unit(pose) for pose in observation.poses]
@@ -293,8 +310,9 @@ class ForceFields:
             u = self.model.factored.solve(loads)
             return tuple(interpolate(self.model.grid, u[..., i], points) for i in (0, 1))  # type: ignore[return-value]
         places, covered = self.model.stations(pose)
-        G = self.model.green.columns(points, np.vstack([places, pose.tip]) if pushes else places)
-        k = G.shape[1] // 2
-        axial = G[:, :k] * axis[0] + G[:, k:] * axis[1]
+        sources = np.vstack([places, pose.tip]) if pushes else places
+        unit = np.eye(len(sources))[:, None, :] * axis[:, None]
+        at = self.model.response.answer(sources, unit, points)[1]
+        axial = at.transpose(1, 0, 2).reshape(2 * len(points), len(sources))
         shaft = (axial[:, : len(places)] @ covered).reshape(2, -1).T
         return (axial[:, -1].reshape(2, -1).T if pushes else zero), shaft

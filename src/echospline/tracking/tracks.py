@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import SimpleITK
 
-from echospline.atomic import give_name, part_of, writing
+from echospline.atomic import appearing
 from echospline.errors import InputError
 from echospline.io import LIMIT, MIB, DisplacementRecord, decoding, head, read_displacement
 from echospline.scene import Floats, NeedlePose, RegularGrid
@@ -56,9 +56,7 @@ def write_track(path: str | Path, track: Track, poses: Sequence[NeedlePose] | No
     suffix = path.suffix.lower()
     if suffix not in (".npz", ".mha"):
         raise InputError(f"tracked motion is written as .npz or .mha; got {path.name!r}")
-    with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part = part_of(path)
+    with appearing(path) as part:
         if suffix == ".npz":
             arrays = {
                 k: getattr(record, k) for k in ("points", "displacement", "times", "tip", "entry", "speed")
@@ -66,9 +64,12 @@ def write_track(path: str | Path, track: Track, poses: Sequence[NeedlePose] | No
             with part.open("wb") as file:
                 np.savez(file, **arrays, confidence=track.confidence)
         else:
-            part = part.with_name(part.name + ".mha")
-            sitk.WriteImage(_vectors(record, track.confidence), str(part))
-        give_name(part, path)
+            named = part.with_name(part.name + ".mha")  # SimpleITK goes by the ending
+            try:
+                sitk.WriteImage(_vectors(record, track.confidence), str(named))
+                named.replace(part)
+            finally:
+                named.unlink(missing_ok=True)
 
 
 def read_track(path: str | Path, *, limit: float = LIMIT) -> TrackRecord:

@@ -16,11 +16,13 @@ from echospline.errors import EchosplineError, InputError, ProtocolError
 from echospline.live import LiveEngine, Numbered, Pacer, Recorder, Snapshot, Trace
 from echospline.scene import NeedlePose
 from echospline.viewer import protocol
+from echospline.viewer.aside import aside
 from echospline.viewer.exercise import Exercise
 from echospline.viewer.guard import Allowance
 from echospline.viewer.scoring import Score, score
 from echospline.viewer.served_scene import Scene, tip_of
-from echospline.viewer.sessions import Sessions
+from echospline.viewer.sessions import Session, Sessions
+from echospline.viewer.words import for_page
 
 log = logging.getLogger(__name__)
 
@@ -92,22 +94,42 @@ class Client:
         self._commands, self._requests = Allowance(400, 400), Allowance(20, 40)
         self._reported, self._intervals = 0.0, deque([FASTEST_DISPLAY], maxlen=16)
         self._failure: str | None = None
+        self._pacer = Pacer(seat.engine)
+        self._told: asyncio.Queue[tuple[str, dict[str, object]]] = asyncio.Queue()
+        self._loop = asyncio.get_running_loop()
         self._credit.set()
 
     async def serve(self, resumed: bool) -> None:
-        """Serve until the page closes or breaks the protocol; the engine's thread ends with it."""
+        """Serve until the page closes or breaks the protocol; `leave` then ends the engine's thread."""
         await self._send_text("scene", **self._describe(resumed))
-        with Pacer(self.seat.engine):
-            tasks = [asyncio.create_task(self._receive()), asyncio.create_task(self._send_frames())]
-            try:
-                done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-            finally:
-                for task in tasks:
-                    task.cancel()
-                results = await asyncio.gather(*tasks, return_exceptions=True)
-            for error in results:
-                await self._close(error)
-            del done
+        self._pacer.start()
+        tasks = [
+            asyncio.create_task(self._receive()),
+            asyncio.create_task(self._send_frames()),
+            asyncio.create_task(self._send_told()),
+        ]
+        try:
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for task in tasks:
+                task.cancel()
+            results = await asyncio.gather(*tasks, return_exceptions=True)
+        for error in results:
+            await self._close(error)
+
+    async def leave(self) -> None:
+        """End the engine's thread; it may be building a model, and nobody else waits for that."""
+        await aside(self._pacer.stop)
+
+    def tell(self, what: str, **content: object) -> None:
+        """Send a message to the page; any thread may call."""
+        if not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(self._told.put_nowait, (what, content))
+
+    async def _send_told(self) -> None:
+        while True:
+            what, content = await self._told.get()
+            await self._send_text(what, **content)
 
     def _describe(self, resumed: bool) -> dict[str, Any]:
         newest = self.seat.engine.snapshots.latest()
@@ -211,7 +233,7 @@ class Client:
         if not keep:
             await self._send_text("stopped")
             return
-        summary = await asyncio.to_thread(self._summary, training, trace, model)
+        summary = await aside(self._summary, training, trace, model)
         await self._send_text("summary", **summary)
 
     def _summary(self, training: Training, trace: Trace, model: str) -> dict[str, Any]:
@@ -226,6 +248,8 @@ class Client:
                 scene=self.seat.scene.title,
                 model=model,
                 source=self.seat.scene.source,
+                picture=self.seat.scene.picture,
+                upload=self.seat.scene.upload,
             )
         history = [
             {"id": s.id, "started": s.started, "score": s.score}
@@ -238,14 +262,15 @@ class Client:
 
     async def _replay(self, number: int) -> None:
         try:
-            session, exercise, trace = await asyncio.to_thread(self.sessions.load, number)
+            session, exercise, trace = await aside(self.sessions.load, number)
             poses = resampled(trace, self.seat.engine.period)
-            if not self.seat.scene.grid.contains(exercise.landmarks).all():
-                raise InputError(
-                    "this session was recorded in another image: its targets lie outside this one"
-                )
         except EchosplineError as error:
-            await self._send_text("notice", text=str(error))
+            await self._send_text("notice", text=for_page(str(error), self.sessions.path))
+            return
+        if not self._shows(session, exercise):
+            await self._send_text("elsewhere", session=number, scene=session.upload, text=(
+                f"session {number} was recorded in another picture, {session.scene}: it is not replayed in this one"
+            ))  # fmt: skip
             return
         recorder = Recorder(self.seat.engine.period, self.seat.engine.period * len(poses))
         self._begin(Training(exercise, recorder, session.trainee, number))
@@ -253,6 +278,13 @@ class Client:
             self.seat.engine.switch(session.model)
         self.seat.engine.replay(poses)
         await self._send_text("running", exercise=exercise.model_dump(), replay=True, model=session.model)
+
+    def _shows(self, session: Session, exercise: Exercise) -> bool:
+        """Test whether this scene shows the picture of a session; sessions of schema 1 know only its title."""
+        scene = self.seat.scene
+        if session.picture:
+            return session.picture == scene.picture
+        return session.scene == scene.title and bool(scene.grid.contains(exercise.landmarks).all())
 
     # --- to the page
 
@@ -270,7 +302,9 @@ class Client:
             if snapshot.failure != self._failure:
                 self._failure = snapshot.failure
                 if snapshot.failure is not None:
-                    await self._send_text("failure", text=snapshot.failure)
+                    await self._send_text(
+                        "failure", text=for_page(snapshot.failure, otherwise="its log says why")
+                    )
             self._sent += 1
             if self._sent - self._drawn >= IN_FLIGHT:
                 self._credit.clear()

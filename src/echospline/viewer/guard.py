@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hmac
+import logging
 import time
 from collections.abc import Callable
 from urllib.parse import urlsplit
@@ -11,6 +12,11 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from echospline.errors import InputError
+
+log = logging.getLogger(__name__)
+
+DEFAULT_PORTS = {"http": 80, "https": 443}
 SUBPROTOCOL = "echospline.1"
 """Offered by the page; a token is sent with it as ``token.<token>``, because a page cannot set headers there."""
 
@@ -43,10 +49,15 @@ class Guard:
         Host names that are accepted (without port); None accepts any and relies on the token.
     token : str or None
         Token that a client must present, if any.
+    origins : tuple of str
+        Origins of reverse proxies, from `checked_origin`: their pages are this server's, whatever Host the proxy sends on.
     """
 
-    def __init__(self, app: ASGIApp, hosts: frozenset[str] | None, token: str | None) -> None:
-        self.app, self.hosts, self.token = app, hosts, token
+    def __init__(
+        self, app: ASGIApp, hosts: frozenset[str] | None, token: str | None, origins: tuple[str, ...] = ()
+    ) -> None:
+        self.app, self.hosts, self.token, self.origins = app, hosts, token, frozenset(origins)
+        self._refused: set[str] = set()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve or refuse one connection."""
@@ -79,7 +90,8 @@ class Guard:
         name = _host_name(hosts[0])
         if name is None or (self.hosts is not None and name not in self.hosts):
             return 421, "this server does not answer to that Host name"
-        if len(origins) > 1 or (origins and urlsplit(origins[0]).netloc.lower() != hosts[0].lower()):
+        if len(origins) > 1 or (origins and not self._is_own(origins[0], hosts[0])):
+            self._log_refused(origins[0])
             return 403, "pages of another origin may not connect"
         secret = scope["type"] == "websocket" or not (
             scope["path"] == "/" or any(scope["path"].startswith(path) for path in PUBLIC)
@@ -87,6 +99,21 @@ class Guard:
         if self.token is not None and secret and not self._token_matches(headers):
             return 401, "the token is missing or wrong: open the address that the server printed"
         return None
+
+    def _is_own(self, origin: str, host: str) -> bool:
+        try:
+            return urlsplit(origin).netloc.lower() == host.lower() or checked_origin(origin) in self.origins
+        except (InputError, ValueError):
+            return False
+
+    def _log_refused(self, origin: str) -> None:
+        """Tell the operator once, not the page, what to do if this is a proxy of theirs."""
+        if origin not in self._refused and len(self._refused) < 20:
+            self._refused.add(origin)
+            log.warning(
+                "a page of %.100r was refused; if it is this server's behind a proxy, start with --origin",
+                origin,
+            )
 
     def _token_matches(self, headers: Headers) -> bool:
         assert self.token is not None  # checked by the caller
@@ -96,6 +123,35 @@ class Guard:
         if scheme.lower() == "bearer":
             given.append(bearer)
         return any(hmac.compare_digest(self.token.encode(), value.encode()) for value in given)
+
+
+def checked_origin(text: str) -> str:
+    """Return an origin in the form in which browsers send it: scheme and host in small letters, no default port.
+
+    Raises
+    ------
+    InputError
+        If it is not ``http://HOST``, ``https://HOST`` or one of them with a port.
+    """
+    try:
+        parts = urlsplit(text.strip().lower())
+        number = parts.port
+    except ValueError:
+        parts, number = urlsplit(""), None
+    if (
+        parts.scheme not in DEFAULT_PORTS
+        or not parts.hostname
+        or parts.username is not None
+        or parts.path not in ("", "/")
+        or parts.query
+        or parts.fragment
+    ):
+        raise InputError(
+            f"an origin is https://HOST or https://HOST:PORT, without a path; got {text[:100]!r}"
+        )
+    host = f"[{parts.hostname}]" if ":" in parts.hostname else parts.hostname
+    port = "" if number in (None, DEFAULT_PORTS[parts.scheme]) else f":{number}"
+    return f"{parts.scheme}://{host}{port}"
 
 
 def _host_name(host: str) -> str | None:

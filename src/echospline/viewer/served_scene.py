@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from math import cos, radians, sin
 from pathlib import Path
 from typing import Any
@@ -56,6 +58,8 @@ class Scene:
         The exercises of this scene.
     source : str
         Description of the scene's origin, stored with each session so that it can be run again; not read here.
+    upload : str
+        Name under which its uploaded picture is stored; empty for the scene that the server began with.
 
     Raises
     ------
@@ -73,6 +77,7 @@ class Scene:
     echo: NeedleEcho = field(default_factory=NeedleEcho)
     exercises: tuple[Exercise, ...] = ()
     source: str = ""
+    upload: str = ""
 
     def __post_init__(self) -> None:
         if max(self.image.grid.shape) > LARGEST_SIDE:
@@ -88,6 +93,13 @@ class Scene:
         """The needle at its entry, outside the tissue."""
         return NeedlePose(self.entry, self.entry)
 
+    @cached_property
+    def picture(self) -> str:
+        """SHA-256 of the pixels with their size and place: equal for the same picture alone."""
+        grid, pixels = self.image.grid, np.ascontiguousarray(self.image.pixels)
+        head = f"{pixels.dtype.str} {pixels.shape} {grid.shape} {grid.spacing} {grid.origin}"
+        return hashlib.sha256(head.encode() + pixels.tobytes()).hexdigest()
+
     def exercise(self, name: str) -> Exercise | None:
         """Return the exercise of a name."""
         return next((exercise for exercise in self.exercises if exercise.name == name), None)
@@ -102,6 +114,7 @@ class Scene:
         echo = PAGE_LOOK | {"diameter": self.echo.diameter, "apex": self.echo.apex}
         return {
             "title": self.title,
+            "upload": self.upload,
             "image": {"columns": columns, "rows": rows, "spacing": spacing, "origin": origin},
             "mesh": {"shape": self.grid.shape, "spacing": self.grid.spacing, "origin": self.grid.origin},
             "models": [{"name": name, "label": label} for name, label in self.names],

@@ -6,16 +6,13 @@ import asyncio
 import contextlib
 import logging
 import re
-import secrets
 import socket
-import tempfile
-import time
 from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from importlib.resources import files
 from math import isfinite
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import uvicorn
 from starlette.applications import Starlette
@@ -28,98 +25,22 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from echospline.errors import EchosplineError, InputError
 from echospline.scene import NeedlePose
-from echospline.viewer.client import Client, Seat
+from echospline.viewer.aside import aside
+from echospline.viewer.client import Client
 from echospline.viewer.guard import SUBPROTOCOL, Guard
+from echospline.viewer.idle import close_idle
 from echospline.viewer.protocol import COMMAND_BYTES, REQUEST_BYTES
+from echospline.viewer.room import LOOPBACK, Room, Settings
 from echospline.viewer.served_scene import Scene, SceneOpener, grey_bytes
 from echospline.viewer.sessions import Sessions, sessions_csv, trace_csv
+from echospline.viewer.upload import UploadError, Uploads
+from echospline.viewer.words import for_page
 
 log = logging.getLogger(__name__)
 
-LOOPBACK = frozenset({"127.0.0.1", "localhost", "::1"})
-UPLOAD_BYTES = 64 * 2**20
-"""Largest uploaded file."""
-UPLOADED_SCENES = 8
-"""Uploaded scenes kept; the oldest is dropped."""
-PARKED, PARKED_FOR = 8, 60.0
-"""Seats kept after their page has closed, and for how many seconds: a reload resumes."""
 STATIC = Path(str(files("echospline.viewer").joinpath("static")))
 _KEY = re.compile(r"[0-9a-f]{32}")
 _SUFFIX = re.compile(r"(\.[A-Za-z0-9]{1,8}){1,3}$")
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Settings of the server.
-
-    Parameters
-    ----------
-    host : str
-        Address to bind to; for an address other than loopback, a token is required.
-    port : int
-        0 binds any free one.
-    rate : float
-        Engine steps per second.
-    clients : int
-        Most pages at once.
-    token : str or None
-        Token that a page must present; generated when the host is not loopback and none is given.
-    nodes : bool or None
-        Send the displacement of every node even where the model is a spline; None decides by the mesh's size.
-    """
-
-    host: str = "127.0.0.1"
-    port: int = 8750
-    rate: float = 120.0
-    clients: int = 64
-    token: str | None = None
-    nodes: bool | None = None
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.port <= 65535:
-            raise InputError(f"port must be from 0 to 65535; got {self.port}")
-        if self.clients < 1:
-            raise InputError(f"clients must be 1 or more; got {self.clients}")
-        if self.token is None and self.host not in LOOPBACK:
-            object.__setattr__(self, "token", secrets.token_urlsafe(24))
-
-
-@dataclass
-class Room:
-    """State of the server while it runs."""
-
-    scenes: OrderedDict[str, Scene]
-    sessions: Sessions
-    settings: Settings
-    opener: SceneOpener | None = None
-    clients: int = 0
-    uploading: asyncio.Lock = field(default_factory=asyncio.Lock)
-    parked: OrderedDict[str, tuple[float, Seat]] = field(default_factory=OrderedDict)
-    taken: list[Seat] = field(default_factory=list)
-
-    def scene(self, name: str) -> Scene | None:
-        """Return a scene; the empty name is the scene that the server was started with."""
-        return self.scenes.get(name)
-
-    def take_seat(self, key: str, name: str, scene: Scene) -> tuple[Seat, bool]:
-        """Return the parked seat of a page that comes back to its scene, or a new one."""
-        self._forget()
-        _, seat = self.parked.pop(key, (0.0, None))
-        if seat is not None and seat.scene is scene:
-            return seat, True
-        return Seat(scene, self.settings.rate), False
-
-    def park(self, key: str, seat: Seat) -> None:
-        """Keep a seat for its page's return; its engine does not run."""
-        self.parked[key] = time.monotonic() + PARKED_FOR, seat
-        self._forget()
-
-    def _forget(self) -> None:
-        now = time.monotonic()
-        for key in [key for key, (until, _) in self.parked.items() if until < now]:
-            del self.parked[key]
-        while len(self.parked) > PARKED:
-            self.parked.popitem(last=False)
 
 
 def build_app(
@@ -139,8 +60,10 @@ def build_app(
         Builds scenes from uploaded files; without it uploads are refused.
     """
     settings = settings or Settings()
-    room = Room(OrderedDict({"": scene}), sessions, settings, opener)
-    hosts = LOOPBACK | {settings.host} if settings.host in LOOPBACK else None
+    room = Room(OrderedDict({"": scene}), sessions, settings, Uploads(settings.uploads), opener)
+    sessions.pictures.sweep(sessions.needs)
+    outside = {str(urlsplit(origin).hostname) for origin in settings.origins}
+    hosts = LOOPBACK | {settings.host} | outside if settings.host in LOOPBACK else None
     app = Starlette(
         routes=[
             Route("/", _index),
@@ -153,8 +76,8 @@ def build_app(
             WebSocketRoute("/live", _live),
             Mount("/static", StaticFiles(directory=STATIC)),
         ],
-        middleware=[Middleware(Guard, hosts=hosts, token=settings.token)],
-        exception_handlers={InputError: _input_error},
+        middleware=[Middleware(Guard, hosts=hosts, token=settings.token, origins=settings.origins)],
+        exception_handlers={InputError: _input_error, UploadError: _refusal},
     )
     app.state.room = room
     return app
@@ -178,6 +101,23 @@ def steer(app: Starlette, pose: NeedlePose, appears: bool) -> None:
             (seat.engine.place if appears else seat.engine.command)(pose.entry, pose.tip)
 
 
+def announce(app: Starlette, text: str) -> None:
+    """Show the state of the tracker on every page of the first scene; any thread may call.
+
+    Parameters
+    ----------
+    app : Starlette
+        From `build_app`.
+    text : str
+        What is wrong with it; empty when it works.
+    """
+    room: Room = app.state.room
+    room.tracker = text
+    for page in list(room.pages):
+        if page.seat.scene is room.scene(""):
+            page.tell("tracker", text=text)
+
+
 def serve(
     app: Starlette, settings: Settings, ready: Callable[[str], None], stop: Callable[[], bool] = lambda: False
 ) -> None:
@@ -199,12 +139,14 @@ def serve(
     InputError
         If the address cannot be bound.
     """
+    room: Room = app.state.room
     listener = _listen(settings)
     port = listener.getsockname()[1]
     name = f"[{settings.host}]" if ":" in settings.host else settings.host
     if settings.host in ("0.0.0.0", "::"):
         name = socket.gethostname()
-    address = f"http://{name}:{port}/" + (f"#token={settings.token}" if settings.token else "")
+    inside = f"http://{name}:{port}"
+    address = f"{(*settings.origins, inside)[0]}/" + (f"#token={settings.token}" if settings.token else "")
     server = uvicorn.Server(
         uvicorn.Config(
             app,
@@ -215,7 +157,7 @@ def serve(
             log_level="warning",
             access_log=False,
             server_header=False,
-            timeout_graceful_shutdown=2,
+            timeout_graceful_shutdown=1,
         )
     )
 
@@ -225,9 +167,13 @@ def serve(
             await asyncio.sleep(0.01)
         if server.started:
             ready(address)
+        watching = asyncio.create_task(close_idle(server.server_state.connections))
         while not serving.done():
             await asyncio.wait([serving], timeout=0.1)
             server.should_exit = server.should_exit or stop()
+            if server.should_exit:
+                room.ending.begin()
+        watching.cancel()
         await serving
 
     with contextlib.suppress(KeyboardInterrupt):
@@ -240,6 +186,9 @@ def _listen(settings: Settings) -> socket.socket:
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        if hasattr(socket, "TCP_USER_TIMEOUT"):  # a line that is cut: bytes that nobody acknowledges
+            listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 15_000)
         listener.bind((settings.host, settings.port))
     except OSError as error:
         listener.close()
@@ -264,26 +213,26 @@ async def _favicon(_: Request) -> Response:
 
 
 async def _image(request: Request) -> Response:
-    scene = _room(request).scene(request.query_params.get("scene", ""))
+    scene = await _room(request).find(request.query_params.get("scene", ""))
     if scene is None:
         return PlainTextResponse("this scene is gone: upload the file again", 404)
-    return Response(grey_bytes(scene.image), media_type="application/octet-stream")
+    return Response(await aside(grey_bytes, scene.image), media_type="application/octet-stream")
 
 
 async def _sessions(request: Request) -> Response:
-    stored = await asyncio.to_thread(_room(request).sessions.newest)
+    stored = await aside(_room(request).sessions.newest)
     return JSONResponse([session.to_dict() for session in stored])
 
 
 async def _sessions_csv(request: Request) -> Response:
-    stored = await asyncio.to_thread(_room(request).sessions.newest, 100_000)
+    stored = await aside(_room(request).sessions.newest, 100_000)
     return _csv(sessions_csv(stored), "echospline-sessions.csv")
 
 
 async def _trace_csv(request: Request) -> Response:
     number = int(request.path_params["number"])
-    _, _, trace = await asyncio.to_thread(_room(request).sessions.load, min(number, 2**53))
-    return _csv(await asyncio.to_thread(trace_csv, trace), f"echospline-session-{number}.csv")
+    _, _, trace = await aside(_room(request).sessions.load, min(number, 2**53))
+    return _csv(await aside(trace_csv, trace), f"echospline-session-{number}.csv")
 
 
 def _csv(text: str, name: str) -> Response:
@@ -301,31 +250,25 @@ async def _upload(request: Request) -> Response:
     if suffix is None:
         return PlainTextResponse("the file's name needs an ending such as .png or .mha", 422)
     spacing = _spacing(request.query_params.get("spacing", ""))
-    if room.uploading.locked():  # one at a time: reading a picture needs memory
-        return PlainTextResponse("another file is being read: try again in a moment", 429)
-    async with room.uploading:
-        return await _open_upload(request, room, room.opener, suffix.group().lower(), spacing)
-
-
-async def _open_upload(
-    request: Request, room: Room, opener: SceneOpener, suffix: str, spacing: tuple[float, float] | None
-) -> Response:
-    with tempfile.TemporaryDirectory(prefix="echospline-") as folder:
-        path = Path(folder) / f"upload{suffix}"
-        size = 0
-        with path.open("wb") as file:
-            async for chunk in request.stream():
-                size += len(chunk)
-                if size > UPLOAD_BYTES:
-                    return PlainTextResponse(f"an upload has at most {UPLOAD_BYTES // 2**20} MiB", 413)
-                file.write(chunk)
-        scene = await asyncio.to_thread(opener, path, spacing)
-    name = secrets.token_hex(8)
-    room.scenes[name] = scene
-    while len(room.scenes) > 1 + UPLOADED_SCENES:
-        oldest = next(key for key in room.scenes if key)
-        del room.scenes[oldest]
-    return JSONResponse({"scene": name})
+    seat = request.query_params.get("seat", "")
+    client = seat if _KEY.fullmatch(seat) else request.client.host if request.client else "?"
+    pictures = room.sessions.pictures
+    with room.uploads.turn(client):
+        part = await aside(pictures.part)
+        try:
+            digest = await room.uploads.receive(request, part)
+            picture = await aside(pictures.keep, part, digest, suffix.group().lower(), spacing)
+        finally:
+            part.unlink(missing_ok=True)
+        if room.scene(picture.name) is None:
+            try:
+                await room.open(picture)
+            except EchosplineError as error:
+                await aside(room.forget, picture.name)
+                if isinstance(error, UploadError):
+                    raise
+                return PlainTextResponse(for_page(str(error), picture.path), 422)
+    return JSONResponse({"scene": picture.name})
 
 
 def _spacing(text: str) -> tuple[float, float] | None:
@@ -343,8 +286,17 @@ def _spacing(text: str) -> tuple[float, float] | None:
     return values[0], values[-1]
 
 
-async def _input_error(_: Request, error: Exception) -> Response:
-    return PlainTextResponse(str(error), 422)
+async def _input_error(request: Request, error: Exception) -> Response:
+    return PlainTextResponse(
+        for_page(str(error), _room(request).sessions.path, otherwise="not possible"), 422
+    )
+
+
+async def _refusal(_: Request, error: Exception) -> Response:
+    assert isinstance(error, UploadError)
+    # A slow body ends with its connection; what is left of others is passed over, so that the answer is read.
+    headers = {"Connection": "close"} if error.status == 408 else None
+    return PlainTextResponse(str(error), error.status, headers=headers)
 
 
 async def _live(websocket: WebSocket) -> None:
@@ -352,10 +304,10 @@ async def _live(websocket: WebSocket) -> None:
     offered = websocket.scope.get("subprotocols", [])
     await websocket.accept(subprotocol=SUBPROTOCOL if SUBPROTOCOL in offered else None)
     name, key = websocket.query_params.get("scene", ""), websocket.query_params.get("seat", "")
-    scene = room.scene(name)
     if offered and SUBPROTOCOL not in offered:
         await websocket.close(1008, f"this server speaks {SUBPROTOCOL}: reload the page")
         return
+    scene = await room.find(name)
     if scene is None:
         await websocket.close(4404, "this scene is gone: upload the file again")
         return
@@ -366,18 +318,43 @@ async def _live(websocket: WebSocket) -> None:
         return
     room.clients += 1
     try:
-        seat, resumed = await asyncio.to_thread(room.take_seat, key, name, scene)
-        room.taken.append(seat)
-        try:
-            await Client(websocket, seat, room.sessions, nodes=room.settings.nodes).serve(resumed)
-        finally:
-            room.taken.remove(seat)
-            if _KEY.fullmatch(key):
-                room.park(key, seat)
+        await _serve_page(websocket, room, scene, key if _KEY.fullmatch(key) else "")
     except WebSocketDisconnect:
         pass
     except EchosplineError as error:
         log.exception("a seat could not be made")
-        await websocket.close(1011, str(error).encode()[:120].decode("utf-8", "ignore"))
+        reason = for_page(str(error), otherwise="the server has a fault; its log says more")
+        await websocket.close(1011, reason.encode()[:120].decode("utf-8", "ignore"))
     finally:
         room.clients -= 1
+
+
+async def _serve_page(websocket: WebSocket, room: Room, scene: Scene, key: str) -> None:
+    """Serve an accepted page until it leaves; with a key its seat is kept for a reload."""
+    if key in room.leaving:  # a reload that is quicker than the end of its engine's thread
+        await room.leaving[key].wait()
+    taking = asyncio.ensure_future(aside(room.take_seat, key, scene))
+    if not await room.ending.first(taking, None):  # building a model may take longer than the end may
+        return
+    seat, resumed = taking.result()
+    page = Client(websocket, seat, room.sessions, nodes=room.settings.nodes)
+    room.taken.append(seat)
+    room.pages.append(page)
+    if room.tracker and scene is room.scene(""):
+        page.tell("tracker", text=room.tracker)
+    try:
+        await page.serve(resumed)
+    finally:
+        left = asyncio.Event()
+        if key:
+            room.leaving[key] = left
+        try:
+            await page.leave()
+        finally:
+            room.taken.remove(seat)
+            room.pages.remove(page)
+            if key:
+                room.park(key, seat)
+            left.set()
+            if room.leaving.get(key) is left:
+                del room.leaving[key]

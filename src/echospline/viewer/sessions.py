@@ -18,9 +18,10 @@ from pydantic import ValidationError
 from echospline.errors import InputError
 from echospline.live import Trace
 from echospline.viewer.exercise import Exercise
+from echospline.viewer.pictures import Pictures
 from echospline.viewer.scoring import Score
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS session (
   id INTEGER PRIMARY KEY,
@@ -32,10 +33,14 @@ CREATE TABLE IF NOT EXISTS session (
   source TEXT NOT NULL,       -- what the scene was made from (a scenario as JSON)
   model TEXT NOT NULL,
   score TEXT NOT NULL,        -- JSON
-  trace BLOB NOT NULL
+  trace BLOB NOT NULL,
+  picture TEXT NOT NULL DEFAULT '', -- SHA-256 of the pixels, empty in sessions of schema 1
+  upload TEXT NOT NULL DEFAULT ''   -- name of the stored picture, empty for the scene that the server began with
 )
 """
-_COLUMNS = "id, started, trainee, exercise, scene, model, source, score"
+_ADDED = ("picture", "upload")
+"""Columns that schema 1 lacks."""
+_COLUMNS = "id, started, trainee, exercise, scene, model, source, score, picture, upload"
 
 
 @dataclass(frozen=True)
@@ -50,6 +55,8 @@ class Session:
     model: str
     source: str
     score: dict[str, Any]
+    picture: str = ""
+    upload: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON, without the source."""
@@ -72,17 +79,21 @@ class Sessions:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.pictures = Pictures(path.with_name(f"{path.stem}-pictures"))
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             with self._open() as database:
                 (version,) = database.execute("PRAGMA user_version").fetchone()
-                if version not in (0, SCHEMA_VERSION):
+                if version not in range(SCHEMA_VERSION + 1):
                     raise InputError(
                         f"{path} was written by another version (schema {version}, this one knows {SCHEMA_VERSION}); "
                         "choose another file with --sessions"
                     )
                 database.execute("PRAGMA journal_mode = WAL")
                 database.execute(_SCHEMA)
+                if version == 1:
+                    for column in _ADDED:
+                        database.execute(f"ALTER TABLE session ADD COLUMN {column} TEXT NOT NULL DEFAULT ''")
                 database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
         except (OSError, sqlite3.Error) as error:
             raise InputError(
@@ -99,16 +110,19 @@ class Sessions:
         scene: str,
         model: str,
         source: str = "",
+        picture: str = "",
+        upload: str = "",
     ) -> int:
         """Store a session in one transaction; returns its id."""
         row = (
             datetime.now(UTC).isoformat(timespec="seconds"), trainee, exercise.name,
             exercise.model_dump_json(), scene, source, model, json.dumps(score.to_dict()), trace.to_bytes(),
+            picture, upload,
         )  # fmt: skip
         with self._open() as database:
             cursor = database.execute(
-                "INSERT INTO session (started, trainee, exercise, definition, scene, source, model, score, trace) "
-                "VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
+                "INSERT INTO session (started, trainee, exercise, definition, scene, source, model, score, trace, "
+                "picture, upload) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
                 row,
             )
             assert cursor.lastrowid is not None  # an INSERT has one
@@ -119,6 +133,12 @@ class Sessions:
         with self._open() as database:
             rows = database.execute(f"SELECT {_COLUMNS} FROM session ORDER BY id DESC LIMIT ?", (limit,))
             return [_session(row) for row in rows]
+
+    def needs(self, upload: str) -> bool:
+        """Test whether a session was recorded in the uploaded picture of this name."""
+        with self._open() as database:
+            found = database.execute("SELECT 1 FROM session WHERE upload = ? LIMIT 1", (upload,)).fetchone()
+        return found is not None
 
     def load(self, number: int) -> tuple[Session, Exercise, Trace]:
         """Read one session with its exercise and trace.
@@ -152,8 +172,10 @@ class Sessions:
 
 
 def _session(columns: Sequence[Any]) -> Session:
-    number, started, trainee, exercise, scene, model, source, scored = columns
-    return Session(number, started, trainee, exercise, scene, model, source, json.loads(scored))
+    number, started, trainee, exercise, scene, model, source, scored, picture, upload = columns
+    return Session(
+        number, started, trainee, exercise, scene, model, source, json.loads(scored), picture, upload
+    )
 
 
 def sessions_csv(sessions: list[Session]) -> str:

@@ -110,6 +110,14 @@ export class Training {
     this.show();
   }
 
+  /**
+   * @param {string | null} running name of the exercise that the server records for this page now
+   * @returns {string} title of the exercise that this page was recording and the server knows nothing of; empty if there is none
+   */
+  lost(running) {
+    return this.running && !this.replaying && this.running.name !== running ? this.running.title : "";
+  }
+
   end() {
     this.running = null;
     this.replaying = false;

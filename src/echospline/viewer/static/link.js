@@ -36,6 +36,7 @@ export class Link {
     this.onTold = onTold;
     this.onState = onState;
     this.token = token();
+    this.seat = seat();
     this.scene = sessionStorage.getItem("scene") ?? "";
     /** @type {Frame | null} newest frame, until it is taken */
     this.newest = null;
@@ -53,7 +54,7 @@ export class Link {
   connect() {
     const address = new URL("/live", location.href);
     address.protocol = location.protocol === "https:" ? "wss:" : "ws:";
-    address.search = new URLSearchParams({ seat: seat(), scene: this.scene }).toString();
+    address.search = new URLSearchParams({ seat: this.seat, scene: this.scene }).toString();
     const socket = new WebSocket(address, this.token ? [SUBPROTOCOL, `token.${this.token}`] : [SUBPROTOCOL]);
     this.socket = socket;
     this.commands = this.drawn = 0;

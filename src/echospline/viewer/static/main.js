@@ -34,6 +34,10 @@ let drawTimes = [];
 /** @type {number[]} */
 let latencies = [];
 let noticeTimer = 0;
+/** @type {number | null} */
+let replayNext = null; // session to replay once its own picture is open
+/** @type {number | null} */
+let replayTried = null; // the last such session: its picture is opened once
 
 /** @type {Renderer} */
 let renderer;
@@ -64,6 +68,30 @@ async function told(message) {
     adopt();
   } else if (message.tell === "failure") fault(`The model stopped: ${message.text}. Reset starts it again.`);
   else if (message.tell === "notice") notice(message.text);
+  else if (message.tell === "tracker") tracker(message.text);
+  else if (message.tell === "elsewhere") elsewhere(message);
+}
+
+/** The tracker that steers the needle is lost, or back (no text). @param {string} text */
+function tracker(text) {
+  fault(text);
+  if (!text) notice("The tracker is back.");
+}
+
+/** A session of another picture: that picture is opened first, if it is stored. @param {any} message */
+function elsewhere(message) {
+  if (message.scene === link.scene || message.session === replayTried) {
+    notice(message.text);
+    return;
+  }
+  replayNext = replayTried = message.session;
+  leave(message.scene);
+}
+
+/** Open another scene; an exercise that runs in this one is given up. @param {string} name */
+function leave(name) {
+  training.end();
+  link.open(name);
 }
 
 /** @param {any} message */
@@ -89,16 +117,21 @@ async function enter(message) {
   compared = null;
   showModel();
   setRange("entry", view.extent.x0 + 1, view.extent.x1 - 1, 0.1);
+  const lost = training.lost(message.running);
   training.setExercises(scene.exercises, message.running);
   controls.enabled = true;
-  fault("");
+  fault(lost ? `The server was started again: your run of “${lost}” is lost. Start it once more.` : "");
   resize();
   link.entered = true;
   stage.dataset.ready = "true";
+  if (replayNext !== null) link.ask({ do: "replay", session: replayNext });
+  replayNext = null;
 }
 
 /** @param {any} message */
 function begin(message) {
+  fault("");
+  replayTried = null;
   training.begin(message);
   controls.enabled = !message.replay;
   if (message.replay && scene.models.some((/** @type {any} */ m) => m.name === message.model)) {
@@ -270,11 +303,11 @@ async function upload(event) {
   if (!file) return;
   said.textContent = "Reading…";
   try {
-    const query = new URLSearchParams({ name: file.name, spacing });
+    const query = new URLSearchParams({ name: file.name, spacing, seat: link.seat });
     const answer = await (await link.fetch(`/api/upload?${query}`, { method: "POST", body: file })).json();
     /** @type {HTMLDialogElement} */ (byId("upload")).close();
     said.textContent = "";
-    link.open(answer.scene);
+    leave(answer.scene);
   } catch (error) {
     said.textContent = error instanceof Error ? error.message : String(error);
   }
