@@ -212,7 +212,11 @@ def run(
         },
         "seconds": perf_counter() - began,
         "files": [*files, "scenario.toml", "run.json"],
-        "versions": {"python": platform.python_version(), "platform": platform.platform(), **_versions()},
+        "versions": {
+            "python": platform.python_version(),
+            "platform": platform.platform(),
+            **package_versions(),
+        },
         "core": describe_core(),
         "parameters": scenario.model_dump(mode="json"),
     }
@@ -221,7 +225,8 @@ def run(
     return report
 
 
-def _versions() -> dict[str, str]:
+def package_versions() -> dict[str, str]:
+    """Return the versions of the packages that a report names."""
     found = {}
     for name in REPORTED_PACKAGES:
         try:

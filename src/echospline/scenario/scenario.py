@@ -33,6 +33,7 @@ from echospline.scenario.sections import (
     Section,
     TissueSection,
 )
+from echospline.scenario.space_section import SpaceSection
 from echospline.scene import (
     Circle,
     Insertion,
@@ -73,6 +74,7 @@ class Scenario(Section):
     output: OutputSection = Field(default_factory=OutputSection)
     probe: ProbeSection = Field(default_factory=ProbeSection)
     phantom: PhantomSection = Field(default_factory=PhantomSection)
+    space: SpaceSection | None = Field(None, description="a scene in space: the image is a volume")
     exercise: list[ExerciseSection] = Field(default=[], description="what can be trained live")
 
     @model_validator(mode="before")
