@@ -121,8 +121,8 @@ def test_a_wrong_suffix_changes_nothing_or_is_named(tmp_path: Path, kind: str) -
     wrong = "dcm" if suffix_of(kind) in ("png", "npz") else "png"
     path = tmp_path / f"a.{wrong}"
     path.write_bytes(SAMPLES[kind])
-    if kind in ("npz", "nii", "nii.gz"):
-        with pytest.raises(InputError, match=r"read_displacement|rename it"):
+    if kind == "npz":
+        with pytest.raises(InputError, match="read_displacement"):
             take(path)
     else:
         take(path)
@@ -136,7 +136,6 @@ def test_a_wrong_suffix_changes_nothing_or_is_named(tmp_path: Path, kind: str) -
         (b"%PDF-1.7 ...", "is a PDF document"),
         (b"hello, this is no picture", "begins with b'hello, t'"),
         (b"MATLAB 5.0 MAT-file", "Matlab"),
-        (b"\x08\x00\x05\x00CS\n\x00ISO_IR 100", "DICOM without its preamble"),
         (b"\x1f\x8b\x08\x00junk", "which no known format does"),
     ],
 )

@@ -60,8 +60,10 @@ def test_pixel_types_are_kept(tmp_path: Path, suffix: str, dtype: type) -> None:
 def test_colour_becomes_luma_or_stays(tmp_path: Path) -> None:
     rgb = np.random.default_rng(2).integers(0, 256, (21, 33, 3), dtype=np.uint8)
     SimpleITK.WriteImage(SimpleITK.GetImageFromArray(rgb, isVector=True), str(tmp_path / "a.mha"))
-    np.testing.assert_array_equal(read(tmp_path / "a.mha", colour=True).pixels, rgb)
-    np.testing.assert_allclose(read(tmp_path / "a.mha").pixels, rgb @ [0.299, 0.587, 0.114], atol=0.5001)
+    np.testing.assert_array_equal(read(tmp_path / "a.mha", spacing=(0.1, 0.1), colour=True).pixels, rgb)
+    np.testing.assert_allclose(
+        read(tmp_path / "a.mha", spacing=(0.1, 0.1)).pixels, rgb @ [0.299, 0.587, 0.114], atol=0.5001
+    )
 
 
 def test_mouse_liver_equals_itk_and_its_header(recordings: Path) -> None:
@@ -76,18 +78,18 @@ def test_mouse_liver_equals_itk_and_its_header(recordings: Path) -> None:
         read(path)
 
 
-def test_plus_scan_converted_picture_says_that_its_spacing_is_doubtful(recordings: Path) -> None:
-    image = read(recordings / "pluslib" / "BkCurvilinearScanConvertedData.igs.mha")
+def test_one_by_one_millimetre_is_no_spacing_but_asked_for(recordings: Path) -> None:
+    path = recordings / "pluslib" / "BkCurvilinearScanConvertedData.igs.mha"
+    with pytest.raises(InputError, match="1 x 1 mm, which writers put where nothing is known.*--spacing"):
+        read(path)
+    image = read(path, spacing=(0.2, 0.2))
     assert image.grid.shape == (600, 400)
-    assert image.grid.spacing == (1.0, 1.0)
-    assert "1 x 1 mm" in image.source
-    assert read(
-        recordings / "pluslib" / "BkCurvilinearScanConvertedData.igs.mha", spacing=(0.2, 0.2)
-    ).spacing == (0.2, 0.2)
+    assert image.spacing == (0.2, 0.2)
+    assert any("1 x 1 mm" in note for note in image.notes)
 
 
 def test_plus_lines_are_turned_so_that_depth_runs_down(recordings: Path) -> None:
-    image = read(recordings / "pluslib" / "BkCurvilinearRfData.igs.mhd")
+    image = read(recordings / "pluslib" / "BkCurvilinearRfData.igs.mhd", spacing=(0.2, 0.02))
     raw = np.fromfile(recordings / "pluslib" / "BkCurvilinearRfData.raw", dtype="<i2").reshape(358, 3480)
     np.testing.assert_array_equal(image.pixels, raw.T)
     assert "not B-mode" in image.source
@@ -143,11 +145,12 @@ def test_slicer_sequence_with_the_list_first_is_a_cine_with_its_times(tmp_path: 
 @pytest.mark.parametrize(("unit", "factor"), [("mm", 1.0), ("cm", 10.0), ("um", 1e-3), ("m", 1000.0)])
 def test_nrrd_lengths_become_millimetres(tmp_path: Path, unit: str, factor: float) -> None:
     header = (
-        "NRRD0004\ntype: uint8\ndimension: 2\nspace dimension: 2\nsizes: 33 21\nspace directions: (0.1,0) (0,0.2)\n"
+        "NRRD0004\ntype: uint8\ndimension: 2\nspace dimension: 2\nsizes: 33 21\n"
+        f"space directions: ({0.1 / factor:.9g},0) (0,{0.2 / factor:.9g})\n"
         f'space units: "{unit}" "{unit}"\nencoding: raw\n\n'
     )
     (tmp_path / "a.nrrd").write_bytes(header.encode() + STACK[0].tobytes())
-    assert read(tmp_path / "a.nrrd").spacing == pytest.approx((0.1 * factor, 0.2 * factor))
+    assert read(tmp_path / "a.nrrd").spacing == pytest.approx((0.1, 0.2))
 
 
 def test_a_header_without_spacing_names_the_option(tmp_path: Path) -> None:

@@ -12,7 +12,15 @@ from echospline.io.displacement import (
 from echospline.io.echoes import EchoWriter, read_echoes
 from echospline.io.kind import head, kind_of
 from echospline.io.needle_path import read_needle
-from echospline.io.reading import SAMPLE, CineStream, open_cine, open_recording, read, read_image
+from echospline.io.reading import (
+    SAMPLE,
+    CineStream,
+    choose_image,
+    open_cine,
+    open_recording,
+    read,
+    read_image,
+)
 from echospline.io.recording import LIMIT, MIB, Recording, decoding
 from echospline.io.samples import SAMPLES, sample_image
 from echospline.io.writing import CineWriter, open_writer
@@ -28,6 +36,7 @@ __all__ = [
     "DisplacementWriter",
     "EchoWriter",
     "Recording",
+    "choose_image",
     "decoding",
     "displacement_shapes",
     "head",

@@ -26,6 +26,8 @@ class UltrasoundImage:
         Pixel centres in mm; ``grid.shape == (columns, rows)``.
     source : str
         Origin of the picture (file, licence), for reports.
+    notes : tuple of str
+        Conclusions and doubts of its reader, one sentence each.
 
     Raises
     ------
@@ -36,6 +38,7 @@ class UltrasoundImage:
     pixels: Pixels
     grid: RegularGrid
     source: str = ""
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         _check_pixels(self.pixels.shape, self.grid)
@@ -70,6 +73,8 @@ class Cine:
         Pixel centres in mm.
     source : str
         Origin of the recording.
+    notes : tuple of str
+        Conclusions and doubts of its reader, one sentence each.
 
     Raises
     ------
@@ -81,6 +86,7 @@ class Cine:
     times: Floats
     grid: RegularGrid
     source: str = ""
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.frames.ndim not in (3, 4) or len(self.frames) == 0:
@@ -102,7 +108,7 @@ class Cine:
 
     def __getitem__(self, index: int) -> UltrasoundImage:
         """Return one frame as an image."""
-        return UltrasoundImage(self.frames[index], self.grid, self.source)
+        return UltrasoundImage(self.frames[index], self.grid, self.source, self.notes)
 
 
 def _check_pixels(shape: tuple[int, ...], grid: RegularGrid) -> None:
