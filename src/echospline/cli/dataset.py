@@ -13,6 +13,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from echospline.cli.notes import print_notes
 from echospline.errors import InputError
 from echospline.scenario import load
 from echospline.study import Task, create_store, make_sample, sweep, write_summary
@@ -44,6 +45,9 @@ def dataset(
     """
     with as_file(files("echospline").joinpath("data", "dataset.toml")) as own:
         bases = [str(path.resolve()) for path in scenarios or [own]]
+        print_notes(
+            f"{Path(base).name}: {note}" for base in bases for note in load(base).doubts(Path(base).parent)
+        )
         shapes = {(s.phantom.grid().shape, s.mesh.nodes) for s in map(load, map(Path, bases))}
         if len(shapes) > 1:
             raise InputError(

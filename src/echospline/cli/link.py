@@ -13,6 +13,7 @@ import numpy as np
 import typer
 from threadpoolctl import threadpool_limits
 
+from echospline.cli.notes import print_notes
 from echospline.cli.options import scenario_from, with_scenario_options
 from echospline.errors import InputError
 from echospline.live import LiveEngine
@@ -197,6 +198,7 @@ def make_stage(
         Points whose motion is reported, mm.
     """
     image = oriented(scenario.read_image(folder), orientation)
+    print_notes([*image.notes, *scenario.doubts(folder)])
     grid = scenario.grid(image)
     insertion = scenario.insertion()
     entry = (float(insertion.entry[0, 0]), float(insertion.entry[0, 1]))
@@ -226,7 +228,7 @@ def oriented(image: UltrasoundImage, orientation: str) -> UltrasoundImage:
         pixels = pixels[:, ::-1]
     if orientation[1] == "N":
         pixels = pixels[::-1]
-    return UltrasoundImage(np.ascontiguousarray(pixels), image.grid, image.source)
+    return UltrasoundImage(np.ascontiguousarray(pixels), image.grid, image.source, image.notes)
 
 
 def _summary(stage: Stage) -> str:

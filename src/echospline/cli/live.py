@@ -15,6 +15,7 @@ from rich.console import Console
 from threadpoolctl import threadpool_limits
 
 from echospline.cli.link import address, make_stage
+from echospline.cli.notes import print_notes
 from echospline.cli.options import scenario_from, with_scenario_options
 from echospline.errors import InputError
 from echospline.openigtlink import PORT, Looks, Naming, Rates, Session, SessionOptions, read_calibration
@@ -86,7 +87,8 @@ def live(
     with the package. Finished exercises are kept (`echospline sessions` lists and exports them).
     """
     scenario, folder = scenario_from(source, changes or {})
-    image = scenario.read_image(folder)
+    scenario, image = scenario.opened(folder, eight_bit=True)
+    print_notes([*image.notes, *scenario.doubts(folder)])
     scene = scene_of(scenario, image, folder)
     settings = Settings(host, port, rate, clients, nodes=nodes)
     kept = Sessions(sessions or default_sessions())
@@ -168,10 +170,10 @@ def opener_for(scenario: Scenario) -> Callable[[Path, tuple[float, float] | None
     """Build a function that turns uploaded images into scenes with the tissue, mesh and model of a scenario."""
 
     def opened(path: Path, spacing: tuple[float, float] | None) -> Scene:
-        values: dict[str, Any] = {"title": "Your image", "image.file": str(path), "image.spacing": spacing, "image.frame": 0,
+        values: dict[str, Any] = {"title": "Your image", "image.file": str(path), "image.spacing": spacing, "image.frame": None, "image.window": None,
                   "image.region": None, "tissue.region": [], "mesh.clamped_points": [], "exercise": []}  # fmt: skip
         bare = scenario.with_values(values, "upload")
-        image = bare.read_image(path.parent)
+        bare, image = bare.opened(path.parent, eight_bit=True)
         x0, x1, y0, _ = bare.grid(image).extent
         return scene_of(bare.with_values({"needle.entry": (x0 + 0.2 * (x1 - x0), y0)}), image, path.parent)
 

@@ -58,6 +58,7 @@ OPTIONS = (
     Option("--spacing", "image.spacing", "LAT,DEPTH", _numbers, "Image"),
     Option("--frame", "image.frame", "N", int, "Image"),
     Option("--region", "image.region", "L,T,R,B", _integers, "Image"),
+    Option("--window", "image.window", "LOW,HIGH", _numbers, "Image"),
     Option("--mesh", "mesh.nodes", "NXxNY", _nodes, "Mesh"),
     Option("--clamped", "mesh.clamped", "EDGE,...", _words, "Mesh"),
     Option("--entry", "needle.entry", "X,Y", _numbers),

@@ -103,7 +103,7 @@ def cine(
         {"needle.path": keyframes(trace), "model.kind": session.model}, f"session {number}"
     )
     folder = Path.cwd()
-    image = scenario.read_image(folder)
+    scenario, image = scenario.opened(folder, eight_bit=None)
     report = run(scenario, image, build_model(scenario, scenario.grid(image), folder=folder), out, folder)
     print(f"results in {out}: {', '.join(report['files'])}")
 

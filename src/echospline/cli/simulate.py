@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from echospline.cli.notes import print_notes
 from echospline.cli.options import scenario_from, with_scenario_options
 from echospline.laboratory import rescatter
 from echospline.picture import ImageFormer
@@ -55,7 +56,8 @@ def demo(out: Out = Path("out/demo"), json_: Json = False) -> None:
 def simulate_into(source: str, out: Path, changes: dict[str, Any], *, as_json: bool) -> None:
     """Run a scenario with a progress bar on a terminal, and print a summary."""
     scenario, folder = scenario_from(source, changes)
-    image = scenario.read_image(folder)
+    scenario, image = scenario.opened(folder, eight_bit=None)
+    print_notes([*image.notes, *scenario.doubts(folder)])
     model = build_model(scenario, scenario.grid(image), folder=folder)
     console = Console(stderr=True)
     with Progress(

@@ -11,12 +11,11 @@ import numpy as np
 
 from echospline.errors import InputError
 from echospline.io.declared import Clock, Declared, followed
-from echospline.io.kind import kind_of
+from echospline.io.kind import PICTURES, kind_of
 from echospline.io.recording import Recording, check_size, decoding
 from echospline.io.still import open_picture
 from echospline.scene import Pixels
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 _TABLE = "times.csv"
 _MOST_TABLE = 2**24
 """Bytes of ``times.csv``; half a million frames fit."""
@@ -40,7 +39,7 @@ def open_folder(path: Path, limit: float, *, whole: bool) -> Recording:
         If there is no picture, one differs in size or type, or ``times.csv`` does not fit.
     """
     files = sorted(
-        (f for f in path.iterdir() if f.suffix.lower() in SUFFIXES and f.is_file()), key=_by_number
+        (f for f in path.iterdir() if f.suffix.lower() in PICTURES and f.is_file()), key=_by_number
     )
     if not files:
         raise InputError(

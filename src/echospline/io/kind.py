@@ -12,7 +12,12 @@ from typing import Literal
 
 from echospline.errors import InputError
 
-Kind = Literal["picture", "gif", "dicom", "metaimage", "nrrd", "nifti", "video", "displacement", "toml"]
+Kind = Literal[
+    "picture", "gif", "dicom", "metaimage", "nrrd", "nifti", "video", "displacement", "toml", "arrays"
+]
+
+PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+"""Suffixes of the pictures of a cine that is a folder."""
 
 HEAD = 4096
 """Bytes read; every signature below lies within them."""
@@ -26,11 +31,10 @@ _PICTURES = {
     b"MM\x00+": "TIFF",
     b"BM": "BMP",
 }
+_ARRAYS = {b"MATLAB 5.0": "Matlab 5", b"MATLAB 7.3": "Matlab 7.3 (HDF5)", b"\x89HDF\r\n\x1a\n": "HDF5"}
 _STRANGERS = {
     b"%PDF": "a PDF document",
     b"PK\x03\x04": "a zip archive",
-    b"\x89HDF\r\n\x1a\n": "an HDF5 file (Matlab 7.3 files are such)",
-    b"MATLAB 5.0": "a Matlab file",
     b"\x93NUMPY": "a single NumPy array",
     b"BZh": "a bzip2 archive",
     b"7z\xbc\xaf": "a 7-zip archive",
@@ -85,6 +89,7 @@ def kind_of(path: Path) -> tuple[Kind, str]:
         If the file cannot be read or is of no known kind.
     """
     start = head(path)
+    start = start.removeprefix(b"\xef\xbb\xbf")  # a byte-order mark before text
     found = _by_magic(start) or _by_structure(start, path)
     if found:
         return found
@@ -100,6 +105,9 @@ def _by_magic(start: bytes) -> tuple[Kind, str] | None:
     for magic, name in _PICTURES.items():
         if start.startswith(magic):
             return "picture", name
+    for magic, name in _ARRAYS.items():
+        if start.startswith(magic):
+            return "arrays", name
     if start[:6] in (b"GIF87a", b"GIF89a"):
         return "gif", "GIF"
     return ("nrrd", "NRRD") if start.startswith(b"NRRD0") else None

@@ -56,7 +56,7 @@ class Layout:
         return prod((self.rows, self.columns, self.channels)) * self.dtype.itemsize
 
     def read(self, frame: int | None) -> Iterator[Pixels]:
-        """Yield the frames, or one of them, each (rows, columns[, 3]) as stored, in native byte order.
+        """Yield the frames, or one of them, each (rows, columns[, 3]) as stored, in native byte order; a fourth channel is left out.
 
         Raises
         ------
@@ -70,9 +70,10 @@ class Layout:
             for picked in stack if frame is None else stack[frame : frame + 1]:
                 yield picked.astype(native)
             return
-        shape = (self.rows, self.columns, 3) if self.channels == 3 else (self.rows, self.columns)
+        shape = (self.rows, self.columns, self.channels) if self.channels > 1 else (self.rows, self.columns)
         for piece in self._pieces(frame, self.frame_bytes):
-            yield np.frombuffer(piece, self.dtype).reshape(shape).astype(native)
+            pixels = np.frombuffer(piece, self.dtype).reshape(shape).astype(native)
+            yield pixels[..., :3] if self.channels == 4 else pixels
 
     def _pieces(self, frame: int | None, size: int) -> Iterator[bytes]:
         count = 1 if self.listed else self.frames

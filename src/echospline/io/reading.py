@@ -224,6 +224,11 @@ def open_recording(path: str | Path, limit: float = LIMIT, *, whole: bool = True
         from echospline.io.video import open_video  # noqa: PLC0415
 
         recording = open_video(path, name, header_limit)
+    elif kind == "arrays":
+        raise InputError(
+            f"{path} ({name}) holds arrays, not pictures; expected {READABLE}: RF lines are read by "
+            "`echospline track FILE --rf MHZ` (open_lines)"
+        )
     elif kind == "displacement":
         raise InputError(
             f"{path} holds arrays (npz), not pictures; expected {READABLE}: use read_displacement"

@@ -113,6 +113,11 @@ class Recording:
     window: tuple[float, float] | None = None
 
     @property
+    def decoded_mib(self) -> float:
+        """MiB of all decoded frames together."""
+        return self.rows * self.columns * self.channels * self.dtype.itemsize * self.frames / MIB
+
+    @property
     def kept(self) -> NDArray[np.intp]:
         """Numbers of the good frames, ascending."""
         return np.arange(self.frames) if self.valid is None else np.flatnonzero(self.valid)

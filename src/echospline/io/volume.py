@@ -102,8 +102,10 @@ def open_volume(path: Path, kind: Kind, format: str, limit: float, *, whole: boo
         axes = [i for i, n in enumerate(size) if n > 1 or i < 2]
         if len(axes) > 3 or len(size) < 2 or (listed and len(axes) > 2):
             raise InputError(f"{path} has {len(size)} axes of {size}; expected an image (2) or a cine (3)")
-        if channels not in (1, 3) and not listed:
-            raise InputError(f"{path} has {channels} values per pixel; expected 1 (grey) or 3 (RGB)")
+        if channels not in (1, 3, 4) and not listed:
+            raise InputError(
+                f"{path} has {channels} values per pixel; expected 1 (grey), 3 (RGB) or 4 (RGBA)"
+            )
         frames = channels if listed else size[axes[2]] if len(axes) == 3 else 1
         channels = 1 if listed else channels
         layout = _layout(path, kind, fields, dtype, (frames, size[1], size[0], channels), listed)
@@ -119,7 +121,11 @@ def open_volume(path: Path, kind: Kind, format: str, limit: float, *, whole: boo
                 return
             stack = _stack(_ITK.GetArrayFromImage(reader.Execute()), size, frames, channels, listed)
             for pixels in stack if frame is None else stack[frame : frame + 1]:
-                yield pixels.astype(dtype, copy=False)
+                yield (
+                    pixels[..., :3].astype(dtype, copy=False)
+                    if channels == 4
+                    else pixels.astype(dtype, copy=False)
+                )
 
     stored = Recording(
         path,
@@ -223,11 +229,11 @@ def _type_name(pixel_id: int) -> str:
 
 
 def _stack(array: Any, size: tuple[int, ...], frames: int, channels: int, listed: bool) -> Pixels:
-    """Return ITK's array as (frames, second axis, first axis[, 3])."""
+    """Return ITK's array as (frames, second axis, first axis[, channels])."""
     if listed:
         frames_last = array.reshape(size[1], size[0], -1)
         return np.moveaxis(frames_last, -1, 0)
-    shape = (frames, size[1], size[0], 3) if channels == 3 else (frames, size[1], size[0])
+    shape = (frames, size[1], size[0], channels) if channels > 1 else (frames, size[1], size[0])
     stack: Pixels = array.reshape(shape)
     return stack
 

@@ -169,6 +169,7 @@ def run(
             "source": image.source,
             "pixels": list(image.pixels.shape),
             "spacing_mm": list(image.spacing),
+            "notes": list(image.notes),
         },
         "model": scenario.model.kind,
         "mesh_nodes": model.grid.size,

@@ -17,7 +17,7 @@ from pydantic import BaseModel, Field, ValidationError
 
 from echospline.atomic import give_name, part_of
 from echospline.errors import InputError
-from echospline.io import read_image
+from echospline.io import choose_image, needs_window, open_recording, read_image
 from echospline.picture import NeedleEcho
 from echospline.scenario.messages import describe as _describe
 from echospline.scenario.messages import sentence, shown
@@ -88,11 +88,58 @@ class Scenario(Section):
 
     def read_image(self, folder: Path) -> UltrasoundImage:
         """Read the image; a relative path starts at ``folder``; sample:phantom is [phantom] at rest."""
+        return self.opened(folder)[1]
+
+    def opened(self, folder: Path, *, eight_bit: bool | None = False) -> tuple[Scenario, UltrasoundImage]:
+        """Read the image, and write the choices that its file left open into the scenario: frame and window.
+
+        Parameters
+        ----------
+        folder : Path
+            Start of relative paths.
+        eight_bit : bool, optional
+            Whether pixels of other types need a window; None where the formats decide. The window chosen is the file's
+            own (DICOM, NIfTI), else the lowest and highest value of the picture, which loses no contrast to the ends.
+
+        Returns
+        -------
+        scenario : Scenario
+            Running it again gives the same image.
+        image : UltrasoundImage
+            Its notes are the reader's and those of the window.
+
+        Raises
+        ------
+        InputError
+            If the file cannot be read, or is a volume and no slice is named.
+        """
         section = self.image
         if section.file == PHANTOM:
-            return self.phantom.still(self.probe.probe())
+            return self, self.phantom.still(self.probe.probe())
         name = section.file if section.file.startswith("sample:") else str(folder / section.file)
-        return read_image(name, spacing=section.spacing, frame=section.frame, region=section.region)
+        if not section.file.strip():
+            raise InputError("image.file is empty; expected an image, a cine or sample:calf")
+        image, frame, asked = choose_image(
+            name, spacing=section.spacing, frame=section.frame, region=section.region
+        )
+        if eight_bit is None:
+            clear = self.output.border == "transparent"
+            eight_bit = needs_window(self.output.formats, image.pixels.dtype, transparent=clear)
+        window = section.window
+        if window is None and eight_bit and image.pixels.dtype != np.uint8:
+            low, high = float(image.pixels.min()), float(image.pixels.max())
+            window = asked or (low, high if high > low else low + 1.0)
+        if window is not None:
+            image = image.windowed(*window)
+        chosen = section.model_copy(
+            update={"window": window, "frame": frame if frame or section.frame is not None else None}
+        )
+        return self.model_copy(update={"image": chosen}), image
+
+    def doubts(self, folder: Path) -> list[str]:
+        """List the notes of the readers on the labels images of the tissue."""
+        files = dict.fromkeys(r.labels.file for r in self.tissue.region if r.labels is not None)
+        return [f"{file}: {note}" for file in files for note in open_recording(folder / file).notes]
 
     def grid(self, image: UltrasoundImage) -> RegularGrid:
         """Lay the mesh over the image."""
@@ -164,7 +211,7 @@ def load(path: str | Path) -> Scenario:
         size = path.stat().st_size
         if size > LARGEST_FILE:
             raise InputError(f"{path} has {size} bytes; a scenario is a TOML file of at most {LARGEST_FILE}")
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")  # some editors begin a file with a byte-order mark
         tree = tomllib.loads(text)
     except OSError as error:
         raise InputError(f"cannot read the scenario {path}: {error.strerror}") from error

@@ -2,7 +2,7 @@
 
 from echospline.scene.echo import Complexes, Display, Echo, EchoCine, fourier_frequencies
 from echospline.scene.grid import EDGES, Floats, RegularGrid, as_points
-from echospline.scene.image import Cine, Pixels, UltrasoundImage
+from echospline.scene.image import Cine, Pixels, UltrasoundImage, shades
 from echospline.scene.imaging_plane import AXIAL, ImagingPlane, Reach, TrackedNeedle, Visible
 from echospline.scene.metrics import MOVED, FieldError, distance, field_error
 from echospline.scene.needle import ZERO_LENGTH, Insertion, NeedlePose
@@ -47,5 +47,6 @@ __all__ = [
     "field_error",
     "fourier_frequencies",
     "frames_of",
+    "shades",
     "transform_between",
 ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +53,24 @@ class UltrasoundImage:
                 f"an image has shape (rows, columns) or (rows, columns, 3 or 4); got {pixels.shape}"
             )
         return cls(pixels, RegularGrid((pixels.shape[1], pixels.shape[0]), spacing), source)
+
+    def windowed(self, low: float, high: float) -> UltrasoundImage:
+        """Return the image in 8 bits: ``low`` becomes black, ``high`` white, values outside black or white.
+
+        A note says what was done, and how many pixels lie outside.
+
+        Raises
+        ------
+        InputError
+            If low is not below high.
+        """
+        values: NDArray[Any] = self.pixels[..., :3] if self.pixels.ndim == 3 else self.pixels
+        grey = shades(values, low, high)
+        outside = float(((values < low) | (values > high)).mean())
+        note = f"values {low:g} to {high:g} are shown as black to white in 8 bits"
+        if outside > 0:
+            note += f"; {outside:.2%} of the pixels lie outside and become black or white"
+        return UltrasoundImage(grey, self.grid, f"{self.source}; {note}", (*self.notes, note))
 
     @property
     def spacing(self) -> tuple[float, float]:
@@ -109,6 +128,22 @@ class Cine:
     def __getitem__(self, index: int) -> UltrasoundImage:
         """Return one frame as an image."""
         return UltrasoundImage(self.frames[index], self.grid, self.source, self.notes)
+
+
+def shades(pixels: Pixels, low: float, high: float) -> NDArray[np.uint8]:
+    """Convert pixels to 8-bit grey: ``low`` becomes 0, ``high`` 255, values outside 0 or 255.
+
+    Raises
+    ------
+    InputError
+        If low is not below high, or a value is not finite.
+    """
+    if not (np.isfinite([low, high]).all() and low < high):
+        raise InputError(f"window must be two pixel values, low before high; got {(low, high)}")
+    shade = (np.asarray(pixels, dtype=np.float64) - low) * (255.0 / (high - low))
+    if not np.isfinite(shade).all():
+        raise InputError("a picture holds values that are not finite")
+    return np.asarray(np.clip(np.rint(shade), 0, 255), dtype=np.uint8)
 
 
 def _check_pixels(shape: tuple[int, ...], grid: RegularGrid) -> None:
