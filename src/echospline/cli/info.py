@@ -101,12 +101,12 @@ def describe(file: str, limit: float = LIMIT) -> dict[str, Any]:
     kind, name = kind_of(path)
     about: dict[str, Any] = {"file": str(path), "format": name, "bytes": path.stat().st_size}
     if kind == "displacement":
-        return about | (_of_echoes(path) if "iq.npy" in _members(path) else _of_displacement(path, limit))
-    if kind == "toml":
-        return about | _of_toml(path)
-    if kind == "arrays":
-        return about | _of_arrays(path)
-    return about | _of_recording(_header(path, limit), limit)
+        about |= _of_echoes(path) if "iq.npy" in _members(path) else _of_displacement(path, limit)
+    elif kind in ("toml", "arrays"):
+        about |= _of_toml(path) if kind == "toml" else _of_arrays(path)
+    else:
+        about |= _of_recording(_header(path, limit), limit)
+    return about
 
 
 def _header(path: Path, limit: float) -> Recording:

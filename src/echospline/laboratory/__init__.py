@@ -1,7 +1,7 @@
 """Synthetic ultrasound with known motion: phantoms, speckle statistics, beamforming and image formers."""
 
 from echospline.laboratory.acoustic import channel_data
-from echospline.laboratory.beamform import LinearArray, delay_and_sum
+from echospline.laboratory.beamform import LinearArray, delay_and_sum, demodulate
 from echospline.laboratory.needle_field import NeedleField
 from echospline.laboratory.phantom import Displacement, Inclusion, Layer, Phantom, Scatterers
 from echospline.laboratory.phantom_cine import displacement_of, phantom_pictures
@@ -18,6 +18,7 @@ __all__ = [
     "Scatterers",
     "channel_data",
     "delay_and_sum",
+    "demodulate",
     "displacement_of",
     "phantom_pictures",
     "rescatter",

@@ -4,7 +4,17 @@ from echospline.tracking.block_matching import BlockMatching
 from echospline.tracking.carrier_phase import CarrierPhase
 from echospline.tracking.dense_flow import DenseFlow
 from echospline.tracking.region import grid_over, inside_ahead, region_ahead
-from echospline.tracking.tracker import FlowTracker, Reference, Track, Tracker, grey_pair, track
+from echospline.tracking.tracker import (
+    FlowTracker,
+    Frame,
+    Frames,
+    Reference,
+    Track,
+    Tracker,
+    grey_pair,
+    levelled,
+    track,
+)
 from echospline.tracking.tracks import read_track, write_track
 
 __all__ = [
@@ -12,12 +22,15 @@ __all__ = [
     "CarrierPhase",
     "DenseFlow",
     "FlowTracker",
+    "Frame",
+    "Frames",
     "Reference",
     "Track",
     "Tracker",
     "grey_pair",
     "grid_over",
     "inside_ahead",
+    "levelled",
     "read_track",
     "region_ahead",
     "track",
