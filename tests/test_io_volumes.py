@@ -80,7 +80,7 @@ def test_mouse_liver_equals_itk_and_its_header(recordings: Path) -> None:
 
 def test_one_by_one_millimetre_is_no_spacing_but_asked_for(recordings: Path) -> None:
     path = recordings / "pluslib" / "BkCurvilinearScanConvertedData.igs.mha"
-    with pytest.raises(InputError, match="1 x 1 mm, which writers put where nothing is known.*--spacing"):
+    with pytest.raises(InputError, match=r"1 x 1 mm, which writers put where nothing is known.*--spacing"):
         read(path)
     image = read(path, spacing=(0.2, 0.2))
     assert image.grid.shape == (600, 400)

@@ -127,13 +127,15 @@ def open_volume(path: Path, kind: Kind, format: str, limit: float, *, whole: boo
                     else pixels.astype(dtype, copy=False)
                 )
 
+    if channels == 4:
+        notes.append("transparency is left out")
     stored = Recording(
         path,
         format,
         size[1],
         size[0],
         frames,
-        channels,
+        min(channels, 3),
         dtype,
         decode,
         single=frames == 1,
