@@ -300,7 +300,11 @@ def test_an_empty_name_is_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 def test_info_of_a_cine_beyond_the_limit_needs_its_header_alone(tmp_path: Path) -> None:
     # 1440 frames of 1280 x 960 without their pixels: a sparse file takes no disk
-    head = volume_header(tmp_path / "a.mha", "Kinds = domain domain list").read_bytes().split(b"LOCAL\n")[0]
+    head = (
+        volume_header(tmp_path / "a.mha", "Kinds = domain domain list", spacing="0.1 0.1 0.03")
+        .read_bytes()
+        .split(b"LOCAL\n")[0]
+    )
     head = head.replace(b"DimSize = 80 48 10", b"DimSize = 1280 960 1800") + b"LOCAL\n"
     with (tmp_path / "long.mha").open("wb") as file:
         file.write(head)

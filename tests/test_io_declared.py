@@ -334,6 +334,7 @@ def test_a_file_without_any_good_frame_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("make", [
     lambda p: volume_header(p / "a.mha"),
     lambda p: volume_header(p / "a.mha", "Kinds = domain domain domain"),
+    lambda p: volume_header(p / "a.mha", "Kinds = domain domain list"),  # as PLUS writes reconstructions
     lambda p: nifti(p / "a.nii"),
     lambda p: dicom(p / "a.dcm", SOPClassUID="1.2.840.10008.5.1.4.1.1.6.2", FrameTime=40),
 ])  # fmt: skip
@@ -353,7 +354,7 @@ def test_a_volume_is_one_and_asks_which_slice(tmp_path: Path, make) -> None:
 
 @pytest.mark.parametrize("extra", ["Kinds = domain domain list", "Kinds = domain domain time"])
 def test_an_axis_of_time_is_a_cine(tmp_path: Path, extra: str) -> None:
-    path = volume_header(tmp_path / "a.mha", extra)
+    path = volume_header(tmp_path / "a.mha", extra, spacing="0.1 0.1 0.04")
     assert describe(str(path))["frames"] == FRAMES
     with pytest.raises(InputError, match="--fps"):
         read(path)
@@ -427,3 +428,9 @@ def test_a_comment_with_spacing_belongs_to_the_shown_picture(tmp_path: Path) -> 
     exif[274] = 6
     Image.fromarray(STACK[0]).save(tmp_path / "a.png", pnginfo=text, exif=exif)
     assert one(tmp_path / "a.png").spacing == (0.1, 0.2)
+
+
+def test_a_reconstruction_of_plus_is_a_volume(recordings: Path) -> None:
+    about = describe(str(recordings / "pluslib" / "SpinePhantomFreehandReconstructed.mha"))
+    assert about["slices"] == 104
+    assert describe(str(recordings / "pluslib" / "SpinePhantomFreehand.igs.mha"))["frames"] == 21

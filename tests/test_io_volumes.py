@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import gzip
 import re
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +15,7 @@ import SimpleITK
 from echospline.errors import InputError
 from echospline.io import open_cine, open_writer, read
 from echospline.scene import Cine, RegularGrid, UltrasoundImage
+from written_inputs import nifti
 
 STACK = np.random.default_rng(5).integers(0, 256, (4, 21, 33), dtype=np.uint8)
 SUFFIXES = ["mha", "mhd", "nrrd", "nhdr", "nii", "nii.gz"]
@@ -216,3 +220,64 @@ def test_four_axes_and_five_values_per_pixel_are_refused(tmp_path: Path) -> None
     )
     with pytest.raises(InputError, match="values per pixel"):
         read(tmp_path / "b.mha")
+
+
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("suffix", ["mha", "nrrd"])
+def test_big_endian_pixels_are_turned_round(tmp_path: Path, suffix: str, packed: bool) -> None:
+    values = (STACK.astype(np.int16) - 100) * 200
+    content = values.astype(">i2").tobytes()
+    if suffix == "mha":
+        head = (
+            "ObjectType = Image\nNDims = 3\nBinaryData = True\nBinaryDataByteOrderMSB = True\n"
+            f"CompressedData = {packed}\nDimSize = 33 21 4\nElementSpacing = 0.1 0.2 1\nElementType = MET_SHORT\n"
+            "ElementDataFile = LOCAL\n"
+        )
+        content = zlib.compress(content) if packed else content
+    else:
+        head = (
+            "NRRD0004\ntype: short\ndimension: 3\nsizes: 33 21 4\nspacings: 0.1 0.2 1\nkinds: domain domain list\n"
+            f"endian: big\nencoding: {'gzip' if packed else 'raw'}\n\n"
+        )
+        content = gzip.compress(content) if packed else content
+    (tmp_path / f"a.{suffix}").write_bytes(head.encode() + content)
+    np.testing.assert_array_equal(read(tmp_path / f"a.{suffix}", fps=10).frames, values)
+    for k in range(4):
+        np.testing.assert_array_equal(read(tmp_path / f"a.{suffix}", frame=k).pixels, values[k])
+
+
+def test_a_gzip_file_of_several_members_is_read_to_its_end(tmp_path: Path) -> None:
+    whole = nifti(tmp_path / "a.nii", stack=STACK).read_bytes()
+    parts = [whole[i : i + 500] for i in range(0, len(whole), 500)]
+    (tmp_path / "b.nii.gz").write_bytes(b"".join(gzip.compress(part) for part in parts))
+    np.testing.assert_array_equal(read(tmp_path / "b.nii.gz", fps=10).frames, STACK)
+    (tmp_path / "c.nii.gz").write_bytes(b"".join(gzip.compress(part) for part in parts[:-1]))
+    with pytest.raises(InputError, match="cut short"):
+        read(tmp_path / "c.nii.gz", fps=10)
+
+
+def test_encodings_that_only_itk_reads_are_left_to_it(tmp_path: Path) -> None:
+    head = (
+        "NRRD0004\ntype: uint8\ndimension: 3\nsizes: 33 21 4\nspacings: 0.1 0.2 1\nkinds: domain domain list\n"
+        "encoding: ascii\n\n"
+    )
+    (tmp_path / "a.nrrd").write_text(head + " ".join(map(str, STACK.ravel())) + "\n")
+    np.testing.assert_array_equal(read(tmp_path / "a.nrrd", fps=10).frames, STACK)
+    np.testing.assert_array_equal(read(tmp_path / "a.nrrd", frame=2).pixels, STACK[2])
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_nifti_equals_what_itk_reads(tmp_path: Path, version: int) -> None:
+    if version == 1:
+        path = nifti(tmp_path / "a.nii", stack=STACK.astype(np.int16), slope=2.0, intercept=1.0)
+    else:
+        path = tmp_path / "a.nii"
+        h = bytearray(544)
+        struct.pack_into("<i8s2h8q", h, 0, 540, b"n+2\0\r\n\x1a\n", 4, 16, 3, 33, 21, 4, 1, 1, 1, 1)
+        struct.pack_into("<8dq2d", h, 104, 1, 0.1, 0.2, 1, 1, 1, 1, 1, 544, 2.0, 1.0)
+        struct.pack_into("<i", h, 500, 2)
+        path.write_bytes(bytes(h) + STACK.astype("<i2").tobytes())
+    itk = SimpleITK.ReadImage(str(path))
+    cine = read(path, fps=10)
+    np.testing.assert_array_equal(cine.frames, SimpleITK.GetArrayFromImage(itk))
+    assert cine.grid.spacing == pytest.approx(itk.GetSpacing()[:2])

@@ -92,12 +92,12 @@ def sequence(
     return path
 
 
-def volume_header(path: Path, *extra: str, stack: np.ndarray = STACK) -> Path:
+def volume_header(path: Path, *extra: str, spacing: str = "0.5 0.5 0.5", stack: np.ndarray = STACK) -> Path:
     """MetaImage of three axes without a word on what the third one is, unless ``extra`` says it."""
     frames, rows, columns = stack.shape
     lines = [
         "ObjectType = Image", "NDims = 3", "BinaryData = True", "BinaryDataByteOrderMSB = False",
-        f"DimSize = {columns} {rows} {frames}", "ElementSpacing = 0.5 0.5 0.5", "ElementType = MET_UCHAR", *extra,
+        f"DimSize = {columns} {rows} {frames}", f"ElementSpacing = {spacing}", "ElementType = MET_UCHAR", *extra,
         "ElementDataFile = LOCAL", "",
     ]  # fmt: skip
     path.write_bytes("\n".join(lines).encode() + stack.tobytes())

@@ -74,7 +74,7 @@ class Turn:
         """Describe the turn."""
         if self.transposed:
             turn = {(True, False): "90 degrees clockwise", (False, True): "90 degrees anticlockwise"}
-            return turn.get((self.flip_lateral, self.flip_depth), "turned by 90 degrees and mirrored")
+            return turn.get((self.flip_lateral, self.flip_depth), "rows and columns exchanged")
         if self.flip_lateral and self.flip_depth:
             return "180 degrees"
         return "mirrored left to right" if self.flip_lateral else "mirrored top to bottom"

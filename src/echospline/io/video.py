@@ -68,6 +68,8 @@ def open_video(path: Path, format: str, limit: float) -> Recording:
             clocks=times,
         )
         said = _turned(said, path, format, notes)
+        if (streams := len(container.streams.video)) > 1:
+            notes.append(f"{streams} video streams: the first taken")
 
     def decode(frame: int | None, colour: bool) -> Iterator[Pixels]:
         count = 0

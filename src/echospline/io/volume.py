@@ -194,15 +194,18 @@ def _declared(
         lengths=tuple(lengths),
         clocks=tuple(clocks),
         valid=per_frame.valid(),
-        volume=_volume(kind, fields, bool(per_frame) or bool(clocks)) if third else "",
+        volume=_volume(kind, fields, spacing, bool(per_frame) or bool(clocks)) if third else "",
         rescale=_rescale(kind, fields),
     )
     return said, notes
 
 
-def _volume(kind: Kind, fields: dict[str, str], framed: bool) -> str:
+def _volume(kind: Kind, fields: dict[str, str], spacing: tuple[float, ...], framed: bool) -> str:
     """Return why the third axis is a direction in space; empty when it is time."""
     kinds = fields.get("kinds", "").lower().split()
+    if not framed and "list" in kinds and kind == "metaimage" and len({*spacing[:3]}) == 1 != spacing[0]:
+        # PLUS has written reconstructed volumes so
+        return "its third axis is called a list, but has no field per frame and the spacing of the other two"
     if framed or any(k in ("list", "time") for k in kinds):
         return ""
     units = re.findall(r'"([^"]*)"', fields.get("units", "")) if kind == "nrrd" else []
