@@ -266,17 +266,35 @@ def test_encodings_that_only_itk_reads_are_left_to_it(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read(tmp_path / "a.nrrd", frame=2).pixels, STACK[2])
 
 
-@pytest.mark.parametrize("version", [1, 2])
-def test_nifti_equals_what_itk_reads(tmp_path: Path, version: int) -> None:
-    if version == 1:
-        path = nifti(tmp_path / "a.nii", stack=STACK.astype(np.int16), slope=2.0, intercept=1.0)
-    else:
-        path = tmp_path / "a.nii"
-        h = bytearray(544)
-        struct.pack_into("<i8s2h8q", h, 0, 540, b"n+2\0\r\n\x1a\n", 4, 16, 3, 33, 21, 4, 1, 1, 1, 1)
-        struct.pack_into("<8dq2d", h, 104, 1, 0.1, 0.2, 1, 1, 1, 1, 1, 544, 2.0, 1.0)
-        struct.pack_into("<i", h, 500, 2)
-        path.write_bytes(bytes(h) + STACK.astype("<i2").tobytes())
+def test_nifti_2_is_read(tmp_path: Path) -> None:
+    h = bytearray(544)
+    struct.pack_into("<i8s2h8q", h, 0, 540, b"n+2\0\r\n\x1a\n", 4, 16, 3, 33, 21, 4, 1, 1, 1, 1)
+    struct.pack_into("<8dq2d", h, 104, 1, 0.1, 0.2, 1, 1, 1, 1, 1, 544, 2.0, 1.0)
+    struct.pack_into("<i", h, 500, 2)
+    (tmp_path / "a.nii").write_bytes(bytes(h) + STACK.astype("<i2").tobytes())
+    cine = read(tmp_path / "a.nii", fps=10)
+    np.testing.assert_array_equal(cine.frames, 2.0 * STACK + 1)
+    assert cine.grid.spacing == (0.1, 0.2)
+
+
+@pytest.mark.parametrize(
+    "kinds", ["RGB-color domain domain", "domain domain RGB-color", "4-color domain domain"]
+)
+def test_colour_of_nrrd_is_where_its_kinds_say(tmp_path: Path, kinds: str) -> None:
+    n = 4 if kinds.startswith("4") else 3
+    rgb = np.random.default_rng(2).integers(0, 256, (21, 33, n), dtype=np.uint8)
+    last = kinds.endswith("color")
+    sizes = f"33 21 {n}" if last else f"{n} 33 21"
+    head = f"NRRD0004\ntype: uint8\ndimension: 3\nsizes: {sizes}\nkinds: {kinds}\nencoding: raw\n\n"
+    content = (np.moveaxis(rgb, -1, 0) if last else rgb).tobytes()
+    (tmp_path / "a.nrrd").write_bytes(head.encode() + content)
+    np.testing.assert_array_equal(
+        read(tmp_path / "a.nrrd", colour=True, spacing=(0.1, 0.1)).pixels, rgb[..., :3]
+    )
+
+
+def test_nifti_equals_what_itk_reads(tmp_path: Path) -> None:
+    path = nifti(tmp_path / "a.nii", stack=STACK.astype(np.int16), slope=2.0, intercept=1.0)
     itk = SimpleITK.ReadImage(str(path))
     cine = read(path, fps=10)
     np.testing.assert_array_equal(cine.frames, SimpleITK.GetArrayFromImage(itk))

@@ -98,7 +98,9 @@ def open_volume(path: Path, kind: Kind, format: str, limit: float, *, whole: boo
                 f"{path} has pixels of type {type_name}; expected integers or floating point numbers"
             )
         dtype = _DTYPES[type_name]
-        listed = channels > 1 and kind == "nrrd" and fields.get("kinds", "").lower().startswith("list")
+        kinds = fields.get("kinds", "").lower().split() if kind == "nrrd" else []
+        # ITK moves a list axis to the front of each pixel, wherever it is in the file
+        listed = channels > 1 and "list" in kinds
         axes = [i for i, n in enumerate(size) if n > 1 or i < 2]
         if len(axes) > 3 or len(size) < 2 or (listed and len(axes) > 2):
             raise InputError(f"{path} has {len(size)} axes of {size}; expected an image (2) or a cine (3)")
@@ -108,8 +110,13 @@ def open_volume(path: Path, kind: Kind, format: str, limit: float, *, whole: boo
             )
         frames = channels if listed else size[axes[2]] if len(axes) == 3 else 1
         channels = 1 if listed else channels
-        layout = _layout(path, kind, fields, dtype, (frames, size[1], size[0], channels), listed)
-        counted = frames if whole or listed or layout is None else 1
+        # channels or frames inside a pixel must be the fastest axis, or the only order that ITK knows is its own
+        first = listed and kinds[0] == "list"
+        own_order = first or (channels == 1 and (not listed or kinds[-1] == "list")) or kind == "metaimage"
+        own_order = own_order or (len(kinds) > 0 and kinds[0] not in ("domain", "space"))
+        shape = (frames, size[1], size[0], channels)
+        layout = _layout(path, kind, fields, dtype, shape, first) if own_order else None
+        counted = frames if whole or first or layout is None else 1
         check_size(path, size[1], size[0], counted, channels * dtype.itemsize, limit)
         _check_bytes(path, fields, prod((frames, size[1], size[0], channels)) * dtype.itemsize)
         said, notes = _declared(kind, fields, reader.GetSpacing(), frames, len(axes) == 3 and not listed)
