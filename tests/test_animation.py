@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -55,8 +56,14 @@ def test_stray_zeros_between_blocks_are_passed_over(tmp_path: Path) -> None:
     np.testing.assert_allclose(read(path, spacing=(0.1, 0.1)).times, 0.07 * np.arange(5))
 
 
-def test_a_gif_without_delays_has_the_times_of_browsers(tmp_path: Path) -> None:
+@pytest.mark.parametrize("blocks", [True, False])
+def test_a_gif_without_delays_has_the_times_of_browsers(tmp_path: Path, blocks: bool) -> None:
     path = animation(tmp_path / "a.gif", 4, 0)
+    if not blocks:
+        path.write_bytes(
+            re.sub(rb"\x21\xf9\x04.{4}\0(?=[\x2c\x21])", b"", path.read_bytes(), flags=re.DOTALL)
+        )
+        assert gif_delays(path) == [None] * 4
     cine = read(path, spacing=(0.1, 0.1))
     np.testing.assert_allclose(cine.times, 0.1 * np.arange(4))
     assert any("no duration" in note for note in cine.notes)
