@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, Literal, get_type_hints
 
 import typer
 from typer.core import TyperCommand, TyperOption
@@ -72,6 +72,7 @@ OPTIONS = (
     Option("--spacing", "image.spacing", "LAT,DEPTH", _numbers, "Image"),
     Option("--frame", "image.frame", "N", int, "Image"),
     Option("--region", "image.region", "L,T,R,B", integers, "Image"),
+    Option("--window", "image.window", "LOW,HIGH", _numbers, "Image"),
     Option("--mesh", "mesh.nodes", "NXxNY", _nodes, "Mesh"),
     Option("--clamped", "mesh.clamped", "EDGE,...", _words, "Mesh"),
     Option("--sliding", "mesh.sliding", "EDGE,...|none", _edges, "Mesh"),
@@ -118,7 +119,6 @@ OPTIONS = (
     Option("--fps", "output.fps", "N", None, "Output"),
     Option("--formats", "output.formats", "NAME,...", _words, "Output"),
     Option("--border", "output.border", "VALUE", _border, "Output"),
-    Option("--window", "output.window", "LOW,HIGH", _numbers, "Output"),
     Option("--folding", "output.folding", "flag|refuse", None, "Output"),
     Option("--image-model", "output.image_model", "warp|rescatter", None, "Output"),
     Option("--needle/--no-needle", "output.needle", "", None, "Output"),
@@ -163,10 +163,10 @@ def with_scenario_options(command: Callable[..., None]) -> Callable[..., None]:
     return wrapped
 
 
-def say(doubts: Iterable[str]) -> None:
-    """Print doubts on stderr, one line each."""
-    for doubt in doubts:
-        print(f"echospline: doubt: {doubt}", file=sys.stderr)
+def say(sentences: Iterable[str], kind: Literal["doubt", "note"] = "doubt") -> None:
+    """Print sentences on stderr, each once, one line each: doubts about the scale of a scene, or notes of the readers of its files."""
+    for sentence in dict.fromkeys(sentences):
+        print(f"echospline: {kind}: {sentence}", file=sys.stderr)
 
 
 class ScenarioCommand(TyperCommand):

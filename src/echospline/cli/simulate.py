@@ -54,8 +54,9 @@ def demo(out: Out = Path("out/demo"), json_: Json = False) -> None:
 def simulate_into(source: str, out: Path, changes: dict[str, Any], *, as_json: bool) -> None:
     """Run a scenario with a progress bar on a terminal, and print a summary."""
     scenario, folder = scenario_from(source, changes)
-    image = scenario.read_image(folder)
-    scenario, doubts = scenario_room.prepared(scenario, image, out)
+    scenario, image = scenario.opened(folder, eight_bit=None)
+    say([*image.notes, *scenario.label_notes(folder)], "note")
+    doubts = scenario_room.check(scenario, image, out)
     say(doubts)
     model = scenario_room.build_model(scenario, scenario.grid(image), folder=folder)
     from rich.console import Console

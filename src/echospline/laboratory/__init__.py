@@ -6,7 +6,7 @@ from echospline.menu import on_demand
 
 if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.laboratory.acoustic import channel_data
-    from echospline.laboratory.beamform import LinearArray, delay_and_sum
+    from echospline.laboratory.beamform import LinearArray, delay_and_sum, demodulate
     from echospline.laboratory.needle_field import NeedleField
     from echospline.laboratory.phantom import Displacement, Inclusion, Layer, Phantom, Scatterers
     from echospline.laboratory.phantom_cine import displacement_of, phantom_pictures
@@ -25,6 +25,7 @@ __all__ = [
     "Scatterers",
     "channel_data",
     "delay_and_sum",
+    "demodulate",
     "displacement_of",
     "phantom_pictures",
     "rescatter",

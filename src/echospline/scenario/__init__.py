@@ -10,10 +10,8 @@ if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.scenario.scale import (
         PHANTOM,
         check,
-        check_points,
         check_store,
         needle_doubts,
-        prepared,
         size_doubts,
     )
     from echospline.scenario.scenario import LARGEST_FILE, Scenario, describe, load, validated
@@ -30,12 +28,10 @@ __all__ = [
     "Scenario",
     "build_model",
     "check",
-    "check_points",
     "check_store",
     "describe",
     "load",
     "needle_doubts",
-    "prepared",
     "run",
     "size_doubts",
     "validated",
