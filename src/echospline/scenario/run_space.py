@@ -6,6 +6,7 @@ import json
 import platform
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from time import perf_counter
@@ -29,6 +30,58 @@ from echospline.scene import Volume
 SLICER = ("igs.mha", "seq.nrrd")
 FAR_OUT = 0.5
 """Share of the picture outside the volume from which a run says so."""
+
+
+@dataclass
+class _Tally:
+    """Counts over the frames of a run."""
+
+    stages: dict[str, list[float]] = field(default_factory=dict)
+    folded: list[dict[str, Any]] = field(default_factory=list)
+    frames: int = 0
+    residual: float = 0.0
+    largest: float = 0.0
+    outside: float = 0.0
+    first: SpatialFrame | None = None
+    shown: SpatialFrame | None = None
+
+    def add(self, frame: SpatialFrame) -> None:
+        for stage, ms in frame.milliseconds.items():
+            self.stages.setdefault(stage, []).append(ms)
+        self.frames += 1
+        self.residual, self.outside = max(self.residual, frame.residual), max(self.outside, frame.outside)
+        self.largest = max(self.largest, float(np.linalg.norm(frame.displacement, axis=1).max()))
+        if frame.folds:
+            self.folded.append({"time_s": round(frame.time, 6), "what": str(frame.folds)})
+        self.first = self.first or frame
+        # the figure shows the moment of deepest insertion, the last one before withdrawal
+        if self.shown is None or (frame.pose.depth >= self.shown.pose.depth - 1e-9 and frame.pose.speed > 0):
+            self.shown = frame
+
+    def report(self) -> dict[str, Any]:
+        return {
+            "frames": self.frames,
+            "largest_displacement_mm": self.largest,
+            "inverse_map_residual_px": self.residual,
+            "folded_frames": self.folded,
+            "outside_share": self.outside,
+            "milliseconds_per_frame": {
+                name: {
+                    "median": float(np.median(ms)),
+                    "p99": float(np.percentile(ms, 99)),
+                    "total": float(np.sum(ms)),
+                }
+                for name, ms in self.stages.items()
+            },
+        }
+
+    def doubts(self) -> list[str]:
+        if self.outside <= FAR_OUT:
+            return []
+        return [
+            f"{100 * self.outside:.0f} % of the picture lies outside the volume at worst and is black: move the probe "
+            "(space.probe.position) or lower its depth"
+        ]
 
 
 def run_space(
@@ -83,70 +136,43 @@ def run_space(
         out.mkdir(parents=True, exist_ok=True)
     probe, insertion = space.probe.probe(), space.needle.insertion()
     planes = space.probe.planes(insertion)
-    stages: dict[str, list[float]] = {}
-    folded: list[dict[str, Any]] = []
-    residual = largest = outside = 0.0
-    first: SpatialFrame | None = None
-    shown: SpatialFrame | None = None
-    count, files = 0, []
     duration = max(insertion.duration, float(planes.times[-1] - insertion.times[0]))
     expected = int(duration * output.fps + 1e-9) + 1
+    tally, lattice = _Tally(), lattice_of(probe)
+    record = SpatialDisplacementWriter(
+        out / "displacement.npz", model.grid.nodes, lattice.nodes.reshape(*lattice.shape[::-1], 2)
+    )
     with ExitStack() as stack:
         stack.enter_context(threadpool_limits(limits=1, user_api="blas"))
-        sinks = []
-        for name in dict.fromkeys(output.formats):
-            files.append(SUFFIX[name])
-            sinks.append(stack.enter_context(open_writer(out / SUFFIX[name], probe.grid, output.fps)))
-        lattice = lattice_of(probe)
-        record = SpatialDisplacementWriter(
-            out / "displacement.npz", model.grid.nodes, lattice.nodes.reshape(*lattice.shape[::-1], 2)
-        )
+        sinks = [
+            stack.enter_context(open_writer(out / SUFFIX[name], probe.grid, output.fps))
+            for name in dict.fromkeys(output.formats)
+        ]
         for frame in simulate_space(
-            volume,
-            probe,
-            planes,
-            insertion,
-            model,
-            fps=output.fps,
-            longest_step=output.longest_step,
-            folding=output.folding,
-            needle=scenario.needle_echo(),
-        ):
+            volume, probe, planes, insertion, model, fps=output.fps, longest_step=output.longest_step,
+            folding=output.folding, needle=scenario.needle_echo(),
+        ):  # fmt: skip
             since = perf_counter()
             for sink in sinks:
                 sink.add(frame.image.pixels, frame.time)
             if output.displacement:
                 record.add(frame.displacement, frame.time, frame.pose, frame.plane, frame.places)
             frame.milliseconds["write"] = 1e3 * (perf_counter() - since)
-            for stage, ms in frame.milliseconds.items():
-                stages.setdefault(stage, []).append(ms)
-            residual, outside = max(residual, frame.residual), max(outside, frame.outside)
-            largest = max(largest, float(np.linalg.norm(frame.displacement, axis=1).max()))
-            if frame.folds:
-                folded.append({"time_s": round(frame.time, 6), "what": str(frame.folds)})
-            first = first or frame
-            if shown is None or (frame.pose.depth >= shown.pose.depth - 1e-9 and frame.pose.speed > 0):
-                shown = frame
-            count += 1
+            tally.add(frame)
             if progress is not None:
-                progress(count, expected)
+                progress(frame.index + 1, expected)
+    files = [SUFFIX[name] for name in dict.fromkeys(output.formats)]
     if output.displacement:
         record.close()
         files.append("displacement.npz")
-    if output.figure and first is not None and shown is not None:
+    if output.figure and tally.first is not None and tally.shown is not None:
         # matplotlib takes longer to load than everything else together: only when a figure is drawn
         from echospline.picture.summary_space import summary_figure_space  # noqa: PLC0415
 
         title = scenario.title or f"{scenario.model.kind} in space: {volume.source}"
-        summary_figure_space(volume, probe, first, shown, out / "summary.png", title=title)
+        summary_figure_space(volume, probe, tally.first, tally.shown, out / "summary.png", title=title)
         files.append("summary.png")
     scenario.save(out / "scenario.toml", folder)
-    said = list(doubts)
-    if outside > FAR_OUT:
-        said.append(
-            f"{100 * outside:.0f} % of the picture lies outside the volume at worst and is black: move the probe (space.probe.position) or "
-            "lower its depth"
-        )
     report = {
         "made": datetime.now(UTC).isoformat(timespec="seconds"),
         "image": {
@@ -156,20 +182,8 @@ def run_space(
         },
         "model": scenario.model.kind,
         "mesh_nodes": model.grid.size,
-        "frames": count,
-        "largest_displacement_mm": largest,
-        "inverse_map_residual_px": residual,
-        "folded_frames": folded,
-        "outside_share": outside,
-        "doubts": said,
-        "milliseconds_per_frame": {
-            name: {
-                "median": float(np.median(ms)),
-                "p99": float(np.percentile(ms, 99)),
-                "total": float(np.sum(ms)),
-            }
-            for name, ms in stages.items()
-        },
+        **tally.report(),
+        "doubts": [*doubts, *tally.doubts()],
         "seconds": perf_counter() - began,
         "files": [*files, "scenario.toml", "run.json"],
         "versions": {

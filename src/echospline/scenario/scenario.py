@@ -108,6 +108,8 @@ class Scenario(Section):
             *tables, last = key.split(".")
             table = tree
             for name in tables:
+                if table.get(name, 0) is None:  # a table that is not there yet: [space]
+                    table[name] = {}
                 table = table[name]
             table[last] = value
         mesh = tree["mesh"]
