@@ -23,10 +23,10 @@ from echospline.mechanics.reference import Reference
 from echospline.mechanics.tps import anchors_for
 from echospline.scene import Floats, SpatialGrid, SpatialPose, Tissue
 
-IN_SPACE = TPSParameters(anchor_spacing=5.0, contact_spacing=2.0, delta=2.0)
+IN_SPACE = TPSParameters(anchor_spacing=4.0, contact_spacing=2.0, delta=2.0)
 """Parameters where none are given: anchors are spread over faces instead of edges, and mesh nodes are further apart than in a picture.
 
-Five faces of 40 x 35 x 30 mm have about 300 anchors 5 mm apart; at the plane's 1.5 mm they would be thousands, and their system is full. A
+Five faces of 40 x 35 x 30 mm have about 450 anchors 4 mm apart; at the plane's 1.5 mm they would be thousands, and their system is full. A
 reach of one node spacing keeps two or more nodes per spacing in contact with a shaft in any direction."""
 
 
