@@ -110,7 +110,7 @@ def stored(state, law):
     eta = float(weights @ ((slip.tip - track.places - slip.moved) @ slip.axis))
     energy = 0.5 * np.einsum("ic,icjd,jd", f, track.compliance, f)
     energy += np.sum(slip.friction[on] ** 2 / (2 * law.bond * slip.covered[on]))
-    energy += np.sum(slip.side[on] ** 2 / (2 * law.side_stiffness * slip.covered[on]))
+    energy += np.sum(slip.side[0, on] ** 2 / (2 * law.side_stiffness * slip.covered[on]))
     if touch > 0:
         energy += slip.push**2 / (2 * law.tip_stiffness * touch)
         energy += law.tip * touch * max(eta - law.tip / law.tip_stiffness, 0.0)

@@ -157,9 +157,9 @@ class NeedleLoad:
     friction : float
         Sum of the friction along the axis, N; positive where the needle pushes the tissue along, negative on withdrawal.
     side : float
-        Sum of the forces across the axis, N; positive towards (-axis_y, axis_x).
+        Sum of the forces across the axis, N; positive towards (-axis_y, axis_x). In space the magnitude of their sum.
     torque : float
-        Of all forces about the point of entry, N mm; positive turns x towards y.
+        Of all forces about the point of entry, N mm; positive turns x towards y. In space the magnitude of the vector.
     cut : float
         Length of track that has been cut so far, mm from the surface. The viscous law keeps none: 0.
     """

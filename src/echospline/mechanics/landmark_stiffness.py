@@ -7,10 +7,12 @@ import numpy as np
 from echospline.mechanics.anchored_kernel import AnchoredKernel
 from echospline.mechanics.kernels import Kernel
 from echospline.mechanics.landmarks import Anchors
-from echospline.scene import Floats, RegularGrid, Tissue
+from echospline.scene import Floats, RegularGrid, SpatialGrid, Tissue
 
 
-def landmark_stiffness(tissue: Tissue, grid: RegularGrid, kernel: Kernel, anchors: Anchors) -> Floats:
+def landmark_stiffness(
+    tissue: Tissue, grid: RegularGrid | SpatialGrid, kernel: Kernel, anchors: Anchors
+) -> Floats:
     """Stiffness per mesh node of an approximating spline, from Young's modulus there.
 
     A needle that pushes with the same force moves tissue in inverse proportion to its modulus. For one landmark alone

@@ -23,7 +23,7 @@ from echospline.mechanics.kernels import Elastic, Kernel
 from echospline.mechanics.landmarks import Clamps
 from echospline.mechanics.parameters import TPSParameters
 from echospline.mechanics.reference import Tip, TPSState
-from echospline.scene import Floats, NeedlePose, RegularGrid
+from echospline.scene import Floats, NeedlePose, RegularGrid, SpatialGrid, SpatialPose
 
 Precision = Literal["single", "double"]
 
@@ -40,8 +40,8 @@ class NativeState:
     saved : bytes
         The state as the core saves it.
     mesh : ndarray, shape (n, 2), or None
-        Displacement of the mesh nodes, mm, read-only; None for a fine mesh, whose displacement is computed when it is asked
-        for.
+        Displacement of the mesh nodes, mm, read-only; None for a fine mesh and in space, where the displacement is computed
+        when it is asked for.
     held_back : int
         Steps since rest in which the landmarks were slowed down so that the picture does not jump.
     """
@@ -95,10 +95,10 @@ class NativeStep:
 
     Parameters
     ----------
-    grid : RegularGrid
-        The mesh.
+    grid : RegularGrid or SpatialGrid
+        The mesh, in the plane (D = 2) or in space (D = 3).
     clamps : Clamps
-        The clamped and sliding edges, and clamped points.
+        The clamped and sliding edges (faces), and clamped points.
     parameters : TPSParameters
         Of the interaction.
     kernel : Kernel
@@ -116,7 +116,7 @@ class NativeStep:
 
     def __init__(
         self,
-        grid: RegularGrid,
+        grid: RegularGrid | SpatialGrid,
         clamps: Clamps,
         parameters: TPSParameters,
         kernel: Kernel,
@@ -125,7 +125,8 @@ class NativeStep:
     ) -> None:
         self._core = core.library()
         self._lock = threading.Lock()
-        self._size, self._fine = grid.size, grid.size > FINE
+        self._size, self._dimension = grid.size, len(grid.shape)
+        self._lazy = self._dimension == 3 or grid.size > FINE
         self._current: NativeState | None = None
         options = _options(grid, clamps, parameters, kernel, precision)
         points = np.ascontiguousarray(clamps.points, dtype=np.float64)
@@ -161,7 +162,7 @@ class NativeStep:
         """State of tissue that no needle has touched."""
         return self._rest
 
-    def advance(self, state: NativeState, pose: NeedlePose, dt: float) -> NativeState:
+    def advance(self, state: NativeState, pose: NeedlePose | SpatialPose, dt: float) -> NativeState:
         """State after the needle has moved to ``pose`` in ``dt`` seconds, equations (12) to (17)."""
         with self._lock:
             self._go_to(state)
@@ -173,7 +174,7 @@ class NativeStep:
             return self._present()
 
     def displacement(self, state: NativeState) -> Floats:
-        """Displacement of the mesh nodes, shape (n, 2), mm."""
+        """Displacement of the mesh nodes, shape (n, D), mm."""
         if state.mesh is not None:
             if len(state.mesh) != self._size:
                 raise InputError(
@@ -183,6 +184,19 @@ class NativeStep:
         with self._lock:
             self._go_to(state)
             return self._mesh()
+
+    def displacement_at(self, state: NativeState, points: Floats) -> Floats:
+        """Displacement of any reference points (n, D) in mm, shape (n, D), mm, in the scene's precision."""
+        p = np.ascontiguousarray(points, dtype=np.float64)
+        if p.ndim != 2 or p.shape[1] != self._dimension:
+            raise InputError(f"points must have shape (n, {self._dimension}) in mm; got {p.shape}")
+        u = np.empty_like(p)
+        with self._lock:
+            self._go_to(state)
+            self._check(
+                self._core.echospline_displacement_at(self._tissue, p.ctypes.data, len(p), u.ctypes.data)
+            )
+        return u
 
     def landmarks(self, state: NativeState) -> TPSState:
         """Return the landmarks of a state as the reference has them (without its pose and field)."""
@@ -194,23 +208,24 @@ class NativeStep:
             self._check(
                 self._core.echospline_landmarks(self._tissue, marks, count.value, ctypes.byref(count))
             )
+        D = self._dimension
         contacts = [m for m in marks if m.node >= 0]
         last = marks[-1] if len(contacts) < len(marks) else None
         tip = (
             None
             if last is None
             else Tip(
-                np.array(last.place[:2]),
-                np.array(last.displacement[:2]),
+                np.array(last.place[:D]),
+                np.array(last.displacement[:D]),
                 last.kind == core.LandmarkKind.TIP,
             )
         )
         return TPSState(
             contacts=np.array([m.node for m in contacts], dtype=np.intp),
             touching=np.array([m.kind == core.LandmarkKind.CONTACT for m in contacts], dtype=bool),
-            q=np.array([m.displacement[:2] for m in contacts], dtype=np.float64).reshape(-1, 2),
+            q=np.array([m.displacement[:D] for m in contacts], dtype=np.float64).reshape(-1, D),
             along=np.array([m.along for m in contacts], dtype=np.float64),
-            grip=np.array([m.grip[:2] for m in contacts], dtype=np.float64).reshape(-1, 2),
+            grip=np.array([m.grip[:D] for m in contacts], dtype=np.float64).reshape(-1, D),
             tip=tip,
             held_back=state.held_back,
         )
@@ -226,7 +241,7 @@ class NativeStep:
             Whether contacts joined or left in it.
         """
         seconds, changes = np.empty(len(poses)), np.zeros(len(poses) + 1, dtype=np.int64)
-        mesh = np.empty((self._size, 2), dtype=np.float32)
+        mesh = np.empty((self._size, self._dimension), dtype=np.float32)
         advance, displacement = self._core.echospline_advance, self._core.echospline_displacement_single
         tissue, at_pose, at_mesh, numbers = self._tissue, self._at_pose, mesh.ctypes.data, mesh.size
         with self._lock:
@@ -244,10 +259,10 @@ class NativeStep:
                 changes[i + 1] = self._statistics.joined + self._statistics.left
         return seconds, np.diff(changes) > 0
 
-    def _set(self, pose: NeedlePose, dt: float) -> None:
-        p = self._pose
-        p.entry[0], p.entry[1] = pose.entry
-        p.tip[0], p.tip[1] = pose.tip
+    def _set(self, pose: NeedlePose | SpatialPose, dt: float) -> None:
+        p, D = self._pose, self._dimension
+        p.entry[:D] = pose.entry
+        p.tip[:D] = pose.tip
         p.speed, p.dt = pose.speed, dt
 
     def _go_to(self, state: NativeState) -> None:
@@ -261,14 +276,14 @@ class NativeStep:
         saved = ctypes.create_string_buffer(self._core.echospline_state_size(self._tissue))
         self._check(self._core.echospline_state_save(self._tissue, saved, len(saved)))
         self._ask_statistics()
-        mesh = None if self._fine else self._mesh()
+        mesh = None if self._lazy else self._mesh()
         if mesh is not None:
             mesh.setflags(write=False)
         self._current = NativeState(saved.raw, mesh, self._statistics.held_back)
         return self._current
 
     def _mesh(self) -> Floats:
-        mesh = np.empty((self._size, 2))
+        mesh = np.empty((self._size, self._dimension))
         self._check(self._core.echospline_displacement(self._tissue, mesh.ctypes.data, mesh.size))
         return mesh
 
@@ -281,16 +296,17 @@ class NativeStep:
 
 
 def _options(
-    grid: RegularGrid, clamps: Clamps, p: TPSParameters, kernel: Kernel, precision: Precision
+    grid: RegularGrid | SpatialGrid, clamps: Clamps, p: TPSParameters, kernel: Kernel, precision: Precision
 ) -> core.SceneOptions:
-    """Options of a scene in the plane."""
-    o = core.SceneOptions(struct_size=ctypes.sizeof(core.SceneOptions), dimension=2)
+    """Options of a scene."""
+    D = len(grid.shape)
+    o = core.SceneOptions(struct_size=ctypes.sizeof(core.SceneOptions), dimension=D)
     o.precision = core.Precision.SINGLE if precision == "single" else core.Precision.DOUBLE
     o.tip = core.Tip.TIP_NODE if p.tip == "node" else core.Tip.TIP_POINT
     o.loading = core.Loading[p.loading.upper()]
     o.clamped = int(sum(core.Edge[edge.upper()] for edge in set(clamps.edges)))
     o.sliding = int(sum(core.Edge[edge.upper()] for edge in set(clamps.sliding)))
-    for d in (0, 1):
+    for d in range(D):
         o.shape[d], o.spacing[d], o.origin[d] = grid.shape[d], grid.spacing[d], grid.origin[d]
     o.sigma, o.delta, o.alpha1, o.alpha2, o.alpha3 = p.sigma, p.delta, p.alpha1, p.alpha2, p.alpha3
     o.length, o.drag, o.friction_speed = p.length, p.drag, p.friction_speed

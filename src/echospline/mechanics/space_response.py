@@ -8,7 +8,7 @@ solutions (G. Fairweather and A. Karageorghis, Adv. Comput. Math. 9, 1998). No m
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -19,6 +19,8 @@ from echospline import _native as core
 from echospline.errors import InputError
 from echospline.mechanics.half_space import Top, gradient, kelvinlet, tractions
 from echospline.mechanics.landmarks import SIDES, Clamps
+from echospline.mechanics.response import SpatialColumn
+from echospline.mechanics.spread import folding
 from echospline.scene import Floats, SpatialGrid, Tissue, as_points
 
 Kind = Literal["clamped", "sliding", "free"]
@@ -235,9 +237,66 @@ class SpaceResponse:
             where = tuple(float(c) for c in p[np.flatnonzero(~self.grid.contains(p))[0]])
             raise InputError(f"forces act inside the tissue; got one at {where} mm")
         p = self._below(p)
-        answer = self._solve @ self._conditions(
-            lambda c: self._moves(c, p, f), lambda c, n: self._pulls(c, n, p, f)
-        )
+        return self._summed(p, f, self._answers(p, f[..., None])[:, 0])
+
+    def column(self, places: Floats, weights: Floats) -> SpatialColumn:
+        """Answer unit forces along x, y and z that are spread over places (m, 3) in mm by weights (m,); see `SpatialResponse`."""
+        p = as_points(places, "places", 3) if len(places) else np.zeros((0, 3))
+        if not self.grid.contains(p).all():
+            raise InputError(f"forces act inside the tissue; got places from {p.min(axis=0)} to {p.max(axis=0)} mm")
+        p = self._below(p)
+        return SpatialColumn(p, weights, self._answers(p, weights[:, None, None] * np.eye(3)))
+
+    def column_at(self, column: SpatialColumn, points: Floats) -> Floats:
+        """Displacement of points (p, 3) in mm by unit forces, shape (p, 3, 3), mm/N; see `SpatialResponse`."""
+        young, poisson = self.tissue.young, self.tissue.poisson
+        u = np.zeros((len(points), 3, 3))
+        if not len(column.places):
+            return u
+        count = 3 * len(self.sources)
+        for k, unit in enumerate(np.eye(3)):
+            every = Forces(
+                np.concatenate([column.places, self.sources]),
+                np.concatenate([column.weights[:, None] * unit, column.made[:count, k].reshape(-1, 3)]),
+                np.concatenate([
+                    np.full(len(column.places), self.radius), np.full(len(self.sources), 1e-3 * self.spacing)
+                ]),
+            )  # fmt: skip
+            u[:, :, k] = ForceField(every, young, poisson, self.top)(points)
+        u += rigid_motions(points - self.middle)[:, :, self._allowed()] @ column.made[count:]
+        return u
+
+    def field_of(self, columns: Sequence[SpatialColumn], forces: Floats) -> ForceField:
+        """Field under forces (k, 3) in N, one for each column; see `SpatialResponse`."""
+        loaded = [(c, f) for c, f in zip(columns, forces, strict=True) if len(c.places) and f.any()]
+        answer = np.zeros(self._solve.shape[0])
+        for column, f in loaded:
+            answer += column.made @ f
+        places = np.concatenate([np.zeros((0, 3)), *(c.places for c, _ in loaded)])
+        loads = np.concatenate([np.zeros((0, 3)), *(np.outer(c.weights, f) for c, f in loaded)])
+        return self._summed(places, loads, answer)
+
+    def warnings(self, columns: Sequence[SpatialColumn], forces: Floats) -> dict[str, str]:
+        """Say where forces (k, 3) in N of the columns are more than tissue bears without |grad u| above 1."""
+        return folding(self.tissue, self.radius, columns, forces)
+
+    def _answers(self, p: Floats, forces: Floats) -> Floats:
+        """Boundary forces (N) and motions (mm) that hold the faces under k load cases (m, 3, k) at p, shape (M, k)."""
+        nu, shape = self.tissue.poisson, (3 * len(p), forces.shape[2])
+        f = self._scale * forces.reshape(shape)
+
+        def moves(c: Floats) -> Floats:
+            return kelvinlet(c, p, nu, self.radius, self.top).reshape(len(c), 3, -1) @ f
+
+        def pulls(c: Floats, n: Floats) -> Floats:
+            t = tractions(gradient(c, p, nu, self.radius, self.top), n, nu)
+            return t.reshape(len(c), 3, -1) @ f
+
+        answers: Floats = self._solve @ self._conditions(moves, pulls)
+        return answers
+
+    def _summed(self, places: Floats, forces: Floats, answer: Floats) -> ForceField:
+        """Field of forces of the needle, and of what the faces answer to them."""
         m = 3 * len(self.sources)
         outer = Forces(
             self.sources, answer[:m].reshape(-1, 3), np.full(len(self.sources), 1e-3 * self.spacing)
@@ -245,7 +304,7 @@ class SpaceResponse:
         spacing, origin, shape, points = self._lattice
         values = displacement(points, outer, self.tissue.young, self.tissue.poisson, self.top)
         values += rigid_motions(points - self.middle)[:, :, self._allowed()] @ answer[m:]
-        needle = Forces(p, f, np.full(len(p), self.radius))
+        needle = Forces(places, forces, np.full(len(places), self.radius))
         smooth = Lattice(spacing, origin, values.reshape(*shape[::-1], 3))
         return ForceField(needle, self.tissue.young, self.tissue.poisson, self.top, smooth)
 

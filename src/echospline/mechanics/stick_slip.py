@@ -1,10 +1,10 @@
 """A needle that sticks, slips and cuts, in plain NumPy: the reading of the law that the native core is compared with.
 
 The track is a row of *stations*, material points h apart, born where the tip cuts (one ahead); each carries a line load of a hat's
-shape. With the needle's axis a, its normal n, the tip's position p, and X_j + u_j where station j is now:
+shape. With the needle's axis a, D - 1 units n across it, the tip's position p, and X_j + u_j where station j is now:
 
     eta_j = (p - X_j - u_j) . a     how far the tip is beyond station j
-    gap_j = (p - X_j - u_j) . n     how far the shaft lies beside it
+    gap_j = (p - X_j - u_j) . n     how far the shaft lies beside it, in each direction across
     w_j                             covered length of its piece of the track, continuous in eta and in the cut front c
     F_j = clip(F_j + k w_j d(eta_j), -fs w_j, fs w_j)      friction: a stop operator against the tissue
     G_j = G_j + k_n w_j d(gap_j)                           across the shaft, both ways
@@ -12,20 +12,25 @@ shape. With the needle's axis a, its normal n, the tip's position p, and X_j + u
 
 F, G and T of one substep solve a box-constrained quadratic programme, because u = C (F a + G n + T a): the tissue moves along. The cut
 front c is the tip's only memory, so a cut track costs friction alone.
+
+The dimension D is that of the poses. In the plane n = (-a_y, a_x). In space the two directions across turn with the axis along the great
+circle, so that G_j stays k_n w_j times the gap as a vector, whichever way the needle has been tilted.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from math import atan2, ceil, cos, hypot, pi, sin
+from itertools import product
+from math import acos, atan2, ceil, cos, hypot, pi, sin
 
 import numpy as np
 from numpy.typing import NDArray
 
 from echospline.errors import SolverError
 from echospline.mechanics.forces import NeedleForces, NeedleLoad
-from echospline.scene import ZERO_LENGTH, Floats, NeedlePose
+from echospline.mechanics.interaction import Pose
+from echospline.scene import ZERO_LENGTH, Floats
 
 HAT = np.array([-0.75, -0.25, 0.25, 0.75]), np.array([0.125, 0.375, 0.375, 0.125])
 """Places of a station's point forces, in station spacings from it along the axis, and their shares of its force."""
@@ -62,11 +67,11 @@ class Station:
 
     Attributes
     ----------
-    place : ndarray, shape (2,)
+    place : ndarray, shape (D,)
         In the undeformed tissue, mm.
-    axis : ndarray, shape (2,)
+    axis : ndarray, shape (D,)
         Of the needle when the station was born.
-    points : ndarray, shape (m, 2)
+    points : ndarray, shape (m, D)
         Where its force acts, mm: those of the four places of its hat that lie in the tissue.
     weights : ndarray, shape (m,)
         Share of the force at each; they add up to one, unless no place lies in the tissue.
@@ -101,25 +106,30 @@ class Track:
     ----------
     stations : tuple of Station
         In the order in which the tip cut.
-    compliance : ndarray, shape (k, 2, k, 2)
+    compliance : ndarray, shape (k, D, k, D)
         Mean displacement over station i, component c, by a unit force at station j, component d, mm/N. Symmetric.
     """
 
     stations: tuple[Station, ...] = ()
     compliance: Floats = field(default_factory=lambda: np.zeros((0, 2, 0, 2)))
 
+    @classmethod
+    def empty(cls, dimension: int) -> Track:
+        """Return a track without stations."""
+        return cls((), np.zeros((0, dimension, 0, dimension)))
+
     def __len__(self) -> int:
         return len(self.stations)
 
     @property
     def places(self) -> Floats:
-        """Stations in the undeformed tissue, shape (k, 2), mm."""
-        return np.array([s.place for s in self.stations]).reshape(-1, 2)
+        """Stations in the undeformed tissue, shape (k, D), mm."""
+        return np.array([s.place for s in self.stations]).reshape(-1, self.compliance.shape[1])
 
     def with_station(self, station: Station, rows: Floats) -> Track:
-        """Add a station; rows (k + 1, 2, 2): displacement of every station, itself last, by its own unit forces."""
-        k = len(self)
-        C = np.zeros((k + 1, 2, k + 1, 2))
+        """Add a station; rows (k + 1, D, D): displacement of every station, itself last, by its own unit forces."""
+        k, D = len(self), self.compliance.shape[1]
+        C = np.zeros((k + 1, D, k + 1, D))
         C[:k, :, :k] = self.compliance
         C[:, :, k] = rows
         C[k] = rows.transpose(2, 0, 1)
@@ -139,15 +149,19 @@ class SlipState:
     ----------
     track : Track
         Of this insertion, or of the last one.
-    tip : ndarray, shape (2,)
+    tip : ndarray, shape (D,)
         Tip that acts: that of the last pose less the play in the depth, mm.
-    axis : ndarray, shape (2,), or None
+    axis : ndarray, shape (D,), or None
         Of the last pose that had one.
+    across : ndarray, shape (D - 1, D)
+        Units across that axis.
     depth : float
         Of the last pose, mm.
-    friction, side, covered : ndarray, shape (k,)
-        F and G, N, and w, mm, of every station.
-    moved : ndarray, shape (k, 2)
+    friction, covered : ndarray, shape (k,)
+        F, N, and w, mm, of every station.
+    side : ndarray, shape (D - 1, k)
+        G, N, along each of the directions across.
+    moved : ndarray, shape (k, D)
         Displacement of the stations, mm.
     push : float
         T, N.
@@ -158,6 +172,7 @@ class SlipState:
     track: Track
     tip: Floats
     axis: Floats | None
+    across: Floats
     depth: float
     friction: Floats
     side: Floats
@@ -167,34 +182,59 @@ class SlipState:
     cut: float
 
 
-def at_rest() -> SlipState:
-    """State of tissue that no needle has touched."""
-    none = np.zeros(0)
-    return SlipState(Track(), np.zeros(2), None, 0.0, none, none, none, np.zeros((0, 2)), 0.0, 0.0)
+def at_rest(dimension: int = 2) -> SlipState:
+    """State of tissue that no needle has touched, in the plane or in space."""
+    none, D = np.zeros(0), dimension
+    return SlipState(
+        Track.empty(D), np.zeros(D), None, np.zeros((D - 1, D)), 0.0, none, np.zeros((D - 1, 0)), none,
+        np.zeros((0, D)), 0.0, 0.0,
+    )  # fmt: skip
 
 
 def station_forces(state: SlipState, spacing: float) -> Floats:
-    """Force at every station, shape (k, 2), N."""
+    """Force at every station, shape (k, D), N."""
     if state.axis is None or not len(state.track):
-        return np.zeros((len(state.track), 2))
+        return np.zeros((len(state.track), len(state.tip)))
     along = state.friction + _front(state.cut, len(state.track), spacing) * state.push
-    forces: Floats = np.outer(along, state.axis) + np.outer(state.side, _normal(state.axis))
-    return forces
+    return _vectors(along, state.side, state.axis, state.across)
 
 
-def load(state: SlipState, spacing: float, pose: NeedlePose) -> NeedleLoad:
-    """Return the needle's forces in a state; the torque is about the entry of the pose."""
+def _vectors(along: Floats, side: Floats, axis: Floats, across: Floats) -> Floats:
+    """Forces along the axis (k,) and across it (D - 1, k) as vectors (k, D)."""
+    vectors: Floats = np.outer(along, axis)
+    for G, n in zip(side, across, strict=True):
+        vectors = vectors + np.outer(G, n)
+    return vectors
+
+
+def load(state: SlipState, spacing: float, pose: Pose) -> NeedleLoad:
+    """Return the needle's forces in a state; the torque is about the entry of the pose.
+
+    In space the forces across the axis and the torque are vectors, and their magnitudes are returned (`wrench` has the vectors).
+    """
     if not len(state.track):
         return NeedleLoad()
     f = station_forces(state, spacing)
+    if len(state.tip) == 3:
+        torque = float(np.linalg.norm(wrench(state, spacing, pose)[1]))
+        side = float(np.linalg.norm(state.side.sum(axis=1)))
+    else:
+        arm = state.track.places + state.moved - np.asarray(pose.entry)
+        torque = float(np.sum(arm[:, 0] * f[:, 1] - arm[:, 1] * f[:, 0]))
+        side = float(state.side.sum())
+    return NeedleLoad(state.push, float(state.friction.sum()), side, torque, state.cut)
+
+
+def wrench(state: SlipState, spacing: float, pose: Pose) -> tuple[Floats, Floats]:
+    """Force (3,) in N of a needle in space on the tissue, and its torque (3,) in N mm about the entry of the pose."""
+    f = station_forces(state, spacing)
     arm = state.track.places + state.moved - np.asarray(pose.entry)
-    torque = float(np.sum(arm[:, 0] * f[:, 1] - arm[:, 1] * f[:, 0]))
-    return NeedleLoad(state.push, float(state.friction.sum()), float(state.side.sum()), torque, state.cut)
+    return f.sum(axis=0), np.cross(arm, f).sum(axis=0)
 
 
 def advance(
     state: SlipState,
-    pose: NeedlePose,
+    pose: Pose,
     dt: float,
     law: NeedleForces,
     extent: tuple[Floats, Floats],
@@ -206,7 +246,8 @@ def advance(
     if axis is None or depth < ZERO_LENGTH:  # it has no direction and touches nothing
         return replace(_released(state), tip=tip, depth=0.0)
     if state.axis is None or state.axis @ axis < 0:  # the first, or drawn out and turned
-        state = replace(_released(state), axis=axis, tip=np.asarray(pose.entry, dtype=np.float64), depth=0.0)
+        entry = np.asarray(pose.entry, dtype=np.float64)
+        state = replace(_released(state), axis=axis, across=_units_across(axis), tip=entry, depth=0.0)
     assert state.axis is not None
     acting = _play(state.tip, tip, axis, law.dead_band)
     length = _length_inside(state)
@@ -214,13 +255,10 @@ def advance(
         hypot(*(acting - state.tip)), hypot(*(acting - length * axis - state.tip + length * state.axis))
     )
     count = int(min(max(1.0, ceil(travel / law.substep - 1e-9)), MOST_SUBSTEPS))
-    start = atan2(state.axis[1], state.axis[0])
-    turn = (atan2(axis[1], axis[0]) - start + pi) % (2 * pi) - pi
-    first, depth0, straight = state.tip, state.depth, axis is state.axis
+    first, depth0, from_axis = state.tip, state.depth, state.axis
     for i in range(1, count + 1):
         s = i / count
-        angle = start + s * turn
-        a = axis if straight or i == count else np.array([cos(angle), sin(angle)])
+        a = axis if axis is from_axis or i == count else _between(from_axis, axis, s)
         state = _substep(
             state, first + s * (acting - first), a, depth0 + s * (depth - depth0), travel / count, dt / count,
             law, extent, supply,
@@ -230,11 +268,14 @@ def advance(
 
 def _released(state: SlipState) -> SlipState:
     """Let go of the tissue; track and cut front stay."""
-    none = np.zeros(len(state.track))
-    return replace(state, friction=none, side=none, covered=none, moved=np.zeros((len(none), 2)), push=0.0)
+    k, D = len(state.track), len(state.tip)
+    none = np.zeros(k)
+    return replace(
+        state, friction=none, side=np.zeros((D - 1, k)), covered=none, moved=np.zeros((k, D)), push=0.0
+    )
 
 
-def _axis(state: SlipState, pose: NeedlePose) -> Floats | None:
+def _axis(state: SlipState, pose: Pose) -> Floats | None:
     """Axis of a pose; the last one where the pose has none, or where they differ by rounding alone."""
     if pose.depth < ZERO_LENGTH:
         return state.axis
@@ -252,8 +293,41 @@ def _play(before: Floats, tip: Floats, axis: Floats, band: float) -> Floats:
     return acting
 
 
-def _normal(axis: Floats) -> Floats:
-    return np.array([-axis[1], axis[0]])
+def _between(start: Floats, end: Floats, share: float) -> Floats:
+    """Axis that has turned from one to another, less than a right angle away, by a share of the angle between them."""
+    if len(start) == 2:
+        first = atan2(start[1], start[0])
+        turn = (atan2(end[1], end[0]) - first + pi) % (2 * pi) - pi
+        return np.array([cos(first + share * turn), sin(first + share * turn)])
+    angle = acos(min(1.0, float(start @ end)))
+    ahead = end - (start @ end) * start
+    length = float(np.linalg.norm(ahead))
+    if length < SAME_AXIS * SAME_AXIS:
+        return end
+    axis: Floats = cos(share * angle) * start + sin(share * angle) / length * ahead
+    return axis
+
+
+def _units_across(axis: Floats) -> Floats:
+    """D - 1 units across an axis, at right angles to each other, shape (D - 1, D); in space any two will do."""
+    if len(axis) == 2:
+        return np.array([[-axis[1], axis[0]]])
+    first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(axis, first)])
+
+
+def _turned(across: Floats, before: Floats, axis: Floats) -> Floats:
+    """Units across an axis after it has turned: about the line at right angles to both, and not about itself."""
+    if len(axis) == 2:
+        return _units_across(axis)
+    if axis is before:
+        return across
+    half = before + axis
+    turned = across - np.outer(across @ axis / (1.0 + before @ axis), half)
+    first = turned[0] - (turned[0] @ axis) * axis  # rounding does not add up
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(axis, first)])
 
 
 def _front(cut: float, count: int, spacing: float) -> Floats:
@@ -298,10 +372,11 @@ def _substep(
     inside = bool(((tip >= extent[0]) & (tip <= extent[1])).all())
     if not touching:
         if not inside:
-            return replace(state, tip=tip, axis=axis, depth=depth)
+            across = _turned(state.across, state.axis, axis)
+            return replace(state, tip=tip, axis=axis, across=across, depth=depth)
         if not _in_the_track(state, tip, axis, law.station_spacing):
             place = _entry(tip, axis, depth, extent)
-            state = _fresh(state, supply(Track(), station_at(place, axis, law.station_spacing, extent)))
+            state = _fresh(state, supply(Track.empty(len(axis)), station_at(place, axis, law.station_spacing, extent)))
     state = _grown(state, axis, RUN_AHEAD * travel, law.station_spacing, extent, supply)
     return _solve(state, tip, axis, depth, travel, dt, law)
 
@@ -310,15 +385,16 @@ def _in_the_track(state: SlipState, tip: Floats, axis: Floats, h: float) -> bool
     """Return whether the needle enters where it had been: both ends of the track lie within h / 2 of its line."""
     if not len(state.track):
         return False
-    places, n = state.track.places, _normal(axis)
+    places = state.track.places
     ends = np.array([places[0], _front(state.cut, len(places), h) @ places])
-    return bool((np.abs((tip - ends) @ n) <= h / 2).all() and (ends[1] - ends[0]) @ axis >= 0)
+    beside = np.linalg.norm((tip - ends) @ _units_across(axis).T, axis=1)
+    return bool((beside <= h / 2).all() and (ends[1] - ends[0]) @ axis >= 0)
 
 
 def _entry(tip: Floats, axis: Floats, depth: float, extent: tuple[Floats, Floats]) -> Floats:
     """Where a shaft that ends at the tip comes into the tissue: on its border, or where the needle begins."""
     way = depth
-    for d in (0, 1):
+    for d in range(len(axis)):
         if axis[d] != 0.0:
             way = min(way, (tip[d] - extent[0 if axis[d] > 0 else 1][d]) / axis[d])
     entry: Floats = np.clip(tip - max(way, 0.0) * axis, *extent)
@@ -327,10 +403,11 @@ def _entry(tip: Floats, axis: Floats, depth: float, extent: tuple[Floats, Floats
 
 def _fresh(state: SlipState, track: Track) -> SlipState:
     """Begin a new track of one station."""
-    zero = np.zeros(1)
+    zero, D = np.zeros(1), len(state.tip)
     return replace(
-        state, track=track, friction=zero, side=zero, covered=zero, moved=np.zeros((1, 2)), push=0.0, cut=0.0
-    )
+        state, track=track, friction=zero, side=np.zeros((D - 1, 1)), covered=zero, moved=np.zeros((1, D)),
+        push=0.0, cut=0.0,
+    )  # fmt: skip
 
 
 def _grown(
@@ -348,14 +425,14 @@ def _grown(
     old = len(state.friction)
     if len(track) == old:
         return state
-    f = station_forces(state, h) if old > 1 else np.zeros((old, 2))
+    f = station_forces(state, h) if old > 1 else np.zeros((old, len(axis)))
     moved = np.einsum("icjd,jd->ic", track.compliance[old:, :, :old], f)
     none = np.zeros(len(track) - old)
     return replace(
         state,
         track=track,
         friction=np.append(state.friction, none),
-        side=np.append(state.side, none),
+        side=np.hstack([state.side, np.zeros((len(state.side), len(none)))]),
         covered=np.append(state.covered, none),
         moved=np.vstack([state.moved, moved]),
     )
@@ -365,25 +442,32 @@ def _grown(
 class _Motion:
     """What a substep is to the stations: compliances in the needle's frame, and motions with the tissue undeformed."""
 
-    along: Floats
+    axis: Floats
     across: Floats
-    mixed: Floats  # displacement along the axis at i by a force across it at j
+    within: list[list[Floats]]  # displacement along direction c at i by a force along d at j; the axis, then those across
     eta: Floats
     eta_gained: Floats  # over eta before the substep, in tissue that had moved
-    gap_gained: Floats
+    gap_gained: list[Floats]  # in every direction across
 
     @classmethod
     def of(cls, state: SlipState, tip: Floats, axis: Floats) -> _Motion:
         assert state.axis is not None
-        C, X, n = state.track.compliance, state.track.places, _normal(axis)
+        C, X = state.track.compliance, state.track.places
+        across = _turned(state.across, state.axis, axis)
+        frame = [axis, *across]
         before = state.tip - X - state.moved
+        within: list[list[Floats]] = [[] for _ in frame]
+        for c, d in product(range(len(frame)), repeat=2):
+            within[c].append(
+                np.einsum("icjd,c,d->ij", C, frame[c], frame[d]) if d >= c else within[d][c].T
+            )  # reciprocity
         return cls(
-            np.einsum("icjd,c,d->ij", C, axis, axis),
-            np.einsum("icjd,c,d->ij", C, n, n),
-            np.einsum("icjd,c,d->ij", C, axis, n),
+            axis,
+            across,
+            within,
             (tip - X) @ axis,
             (tip - X) @ axis - before @ state.axis,
-            (tip - X) @ n - before @ _normal(state.axis),
+            [(tip - X) @ n - before @ n0 for n, n0 in zip(across, state.across, strict=True)],
         )
 
 
@@ -401,7 +485,7 @@ def _solve(
         w, weights = _covered(motion.eta - moved @ axis, cut, track, h), _front(cut, len(track), h)
         touch = float(weights @ exists)
         F, G, T = _forces(state, motion, w, weights, touch, dt, law)
-        f = np.outer(F + weights * T, axis) + np.outer(G, _normal(axis))
+        f = _vectors(F + weights * T, G, axis, motion.across)
         moved = np.einsum("icjd,jd->ic", track.compliance, f)
         eta = motion.eta - moved @ axis
         back = float(((state.moved - moved) @ axis).max())
@@ -415,8 +499,8 @@ def _solve(
             break
         cut = front
     return replace(
-        state, tip=tip, axis=axis, depth=depth, friction=F, side=G, covered=w, moved=moved, push=T,
-        cut=pairs[-1][0],
+        state, tip=tip, axis=axis, across=motion.across, depth=depth, friction=F, side=G, covered=w, moved=moved,
+        push=T, cut=pairs[-1][0],
     )  # fmt: skip
 
 
@@ -429,31 +513,31 @@ def _forces(
     dt: float,
     law: NeedleForces,
 ) -> tuple[Floats, Floats, float]:
-    """F, G and T for covered lengths w and a tip between the stations of these weights, ``touch`` of it in the tissue."""
+    """F, G (D - 1, k) and T for covered lengths w and a tip between the stations of these weights, ``touch`` of it in the tissue."""
     on = np.flatnonzero(w > 0)
-    m, here, t = len(on), np.ix_(on, on), weights[:, None]
+    m, D, here, t = len(on), len(motion.within), np.ix_(on, on), weights[:, None]
     kept = np.minimum(1.0, w[on] / np.where(state.covered[on] > 0, state.covered[on], np.inf))
     bond, firm, limit = law.bond * w[on], law.side_stiffness * w[on], law.friction_limit * w[on]
     pressing = law.tip_stiffness * touch if touch > 0 else 1.0
+    W = motion.within
     A = np.block([
-        [motion.along[here], motion.mixed[here], (motion.along @ t)[on]],
-        [motion.mixed.T[here], motion.across[here], (motion.mixed.T @ t)[on]],
-        [(t.T @ motion.along)[:, on], (t.T @ motion.mixed)[:, on], t.T @ motion.along @ t],
+        *([*(W[c][d][here] for d in range(D)), (W[c][0] @ t)[on]] for c in range(D)),
+        [*((t.T @ W[0][d])[:, on] for d in range(D)), t.T @ W[0][0] @ t],
     ])  # fmt: skip
-    A += np.diag(np.r_[1 / bond, 1 / firm, 1 / pressing])
-    b = np.r_[
+    A += np.diag(np.r_[1 / bond, np.tile(1 / firm, D - 1), 1 / pressing])
+    b = np.concatenate([
         kept * state.friction[on] / bond + motion.eta_gained[on],
-        kept * state.side[on] / firm + motion.gap_gained[on],
-        weights @ motion.eta,
-    ]
-    free = np.full(m, np.inf)
-    soft = np.zeros(2 * m + 1)
+        *(kept * G[on] / firm + gap[on] for G, gap in zip(state.side, motion.gap_gained, strict=True)),
+        [weights @ motion.eta],
+    ])  # fmt: skip
+    free = np.full((D - 1) * m, np.inf)
+    soft = np.zeros(D * m + 1)
     if law.viscosity > 0:
         soft[:m] = dt / (law.viscosity * w[on])
     z = solve_box(A, b, np.r_[-limit, -free, 0.0], np.r_[limit, free, law.tip * touch], soft)
-    F, G = np.zeros(len(w)), np.zeros(len(w))
-    F[on], G[on] = z[:m], z[m : 2 * m]
-    return F, G, float(z[-1])
+    F, side = np.zeros(len(w)), np.zeros((D - 1, len(w)))
+    F[on], side[:, on] = z[:m], z[m:-1].reshape(D - 1, m)
+    return F, side, float(z[-1])
 
 
 def _next_front(pairs: list[tuple[float, float]], least: float, most: float) -> float:

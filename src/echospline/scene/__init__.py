@@ -14,7 +14,18 @@ if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.scene.number import is_number
     from echospline.scene.probe import Probe
     from echospline.scene.space import PlanePath, SpatialGrid, SpatialInsertion, SpatialPose, probe_plane
-    from echospline.scene.tissue import Circle, Label, Layer, Polygon, Region, Shape, Tissue
+    from echospline.scene.tissue import (
+        Box,
+        Circle,
+        Label,
+        Layer,
+        Polygon,
+        Region,
+        Shape,
+        Sphere,
+        Tissue,
+        VolumeLabel,
+    )
     from echospline.scene.transducer import FWHM, TRANSDUCERS, Transducer
     from echospline.scene.transform import as_transform, chain_between, frames_of, transform_between
     from echospline.scene.volume import Volume, Voxels
@@ -28,6 +39,7 @@ __all__ = [
     "MOVED",
     "TRANSDUCERS",
     "ZERO_LENGTH",
+    "Box",
     "Cine",
     "Circle",
     "Complexes",
@@ -52,12 +64,14 @@ __all__ = [
     "SpatialGrid",
     "SpatialInsertion",
     "SpatialPose",
+    "Sphere",
     "Tissue",
     "TrackedNeedle",
     "Transducer",
     "UltrasoundImage",
     "Visible",
     "Volume",
+    "VolumeLabel",
     "Voxels",
     "as_points",
     "as_transform",

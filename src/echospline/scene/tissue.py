@@ -1,4 +1,4 @@
-"""Material of the tissue: Young's modulus and Poisson's ratio, region by region."""
+"""Material of the tissue, in the plane and in space: Young's modulus and Poisson's ratio, region by region."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from echospline.errors import InputError
 from echospline.scene.grid import Floats, RegularGrid, as_points
+from echospline.scene.space import SpatialGrid
 
 Mask = NDArray[np.bool_]
 
 
 class Shape(Protocol):
-    """Place of a region."""
+    """Place of a region, in the plane (D = 2), in space (D = 3) or, as a layer, in both."""
 
     def contains(self, points: Floats) -> Mask:
-        """Test which points (n, 2) in mm belong to the region, shape (n,)."""
+        """Test which points (n, D) in mm belong to the region, shape (n,)."""
         ...
 
 
@@ -56,6 +57,7 @@ class Circle:
 
     def contains(self, points: Floats) -> Mask:
         """Test which points lie within the radius."""
+        _refuse_other(points, 2, "a circle", "a sphere")
         inside: Mask = np.hypot(*(points - self.centre).T) <= self.radius
         return inside
 
@@ -72,6 +74,7 @@ class Polygon:
 
     def contains(self, points: Floats) -> Mask:
         """Test which points lie inside, by the parity of edges that a ray along +x crosses."""
+        _refuse_other(points, 2, "a polygon", "a box or labels of a volume")
         a = np.asarray(self.vertices, dtype=np.float64)
         b = np.roll(a, -1, axis=0)
         x, y = points[:, 0, None], points[:, 1, None]
@@ -99,10 +102,74 @@ class Label:
 
     def contains(self, points: Floats) -> Mask:
         """Test which points have this label; none outside the image."""
+        _refuse_other(points, 2, "a labels image", "labels of a volume")
         ix, iy = np.rint(self.grid.to_index(points)).astype(np.intp).T
         nx, ny = self.grid.shape
         within = (ix >= 0) & (ix < nx) & (iy >= 0) & (iy < ny)
         inside: Mask = within & (self.labels[np.clip(iy, 0, ny - 1), np.clip(ix, 0, nx - 1)] == self.value)
+        return inside
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A round lesion in space: ``centre`` (x, y, z) and ``radius`` in mm."""
+
+    centre: tuple[float, float, float]
+    radius: float
+
+    def __post_init__(self) -> None:
+        as_points(self.centre, "centre of a sphere", 3)
+        if not (np.isfinite(self.radius) and self.radius > 0):
+            raise InputError(f"radius of a sphere must be a positive number in mm; got {self.radius}")
+
+    def contains(self, points: Floats) -> Mask:
+        """Test which points lie within the radius."""
+        _refuse_other(points, 3, "a sphere", "a circle")
+        inside: Mask = np.linalg.norm(points - self.centre, axis=1) <= self.radius
+        return inside
+
+
+@dataclass(frozen=True)
+class Box:
+    """Everything between two corners in space: ``low`` and ``high`` (x, y, z) in mm, faces included."""
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        low, high = as_points(self.low, "low corner", 3)[0], as_points(self.high, "high corner", 3)[0]
+        if not (low < high).all():
+            raise InputError(f"a box spans from a lower to a higher corner; got {self.low} to {self.high} mm")
+
+    def contains(self, points: Floats) -> Mask:
+        """Test which points lie between the corners."""
+        _refuse_other(points, 3, "a box", "a polygon")
+        inside: Mask = ((points >= self.low) & (points <= self.high)).all(axis=1)
+        return inside
+
+
+@dataclass(frozen=True)
+class VolumeLabel:
+    """Voxels of a labels volume that hold one value: ``labels`` [z, y, x] of integers on ``grid`` (nearest voxel)."""
+
+    labels: NDArray[np.integer] = field(repr=False)
+    grid: SpatialGrid
+    value: int
+
+    def __post_init__(self) -> None:
+        if self.labels.shape != self.grid.shape[::-1] or not np.issubdtype(self.labels.dtype, np.integer):
+            raise InputError(
+                f"labels of a volume must be integers of shape {self.grid.shape[::-1]} (z, y, x); "
+                f"got {self.labels.dtype} of {self.labels.shape}"
+            )
+
+    def contains(self, points: Floats) -> Mask:
+        """Test which points have this label; none outside the volume."""
+        _refuse_other(points, 3, "labels of a volume", "a labels image")
+        index = np.rint((points - self.grid.origin) / self.grid.spacing).astype(np.intp)
+        within = ((index >= 0) & (index < self.grid.shape)).all(axis=1)
+        x, y, z = np.clip(index, 0, np.subtract(self.grid.shape, 1)).T
+        inside: Mask = within & (self.labels[z, y, x] == self.value)
         return inside
 
 
@@ -162,8 +229,14 @@ class Tissue:
         return all((r.young, r.poisson) == (self.young, self.poisson) for r in self.regions)
 
     def at(self, points: ArrayLike) -> tuple[Floats, Floats]:
-        """Return Young's modulus (kPa) and Poisson's ratio at points (n, 2) in mm, each of shape (n,)."""
-        p = as_points(points)
+        """Return Young's modulus (kPa) and Poisson's ratio at points (n, 2), in space (n, 3), in mm, each of shape (n,).
+
+        Raises
+        ------
+        InputError
+            If a region is one of the plane and the points lie in space, or the other way round.
+        """
+        p = as_points(points, dimension=3 if np.shape(points)[-1:] == (3,) else 2)
         young, poisson = np.full(len(p), float(self.young)), np.full(len(p), float(self.poisson))
         for region in self.regions:
             inside = region.shape.contains(p)
@@ -204,3 +277,10 @@ def _check(young: float, poisson: float, owner: str) -> None:
         raise InputError(f"Young's modulus of {owner} must be a positive number in kPa; got {young}")
     if not -1 < poisson <= 0.5:
         raise InputError(f"Poisson's ratio of {owner} must lie in (-1, 0.5]; got {poisson}")
+
+
+def _refuse_other(points: Floats, dimension: int, shape: str, instead: str) -> None:
+    """Refuse points of the other dimension."""
+    if points.shape[1] != dimension:
+        here, there = ("the plane", "space") if dimension == 2 else ("space", "the plane")
+        raise InputError(f"{shape} lies in {here}, and this tissue in {there}: use {instead} or a layer")
