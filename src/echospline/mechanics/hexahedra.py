@@ -43,7 +43,9 @@ def lines_for(grid: SpatialGrid, tissue: Tissue, cell: float) -> tuple[Floats, F
     low, high = grid.corners
     lines = [np.linspace(a, b, max(1, round((b - a) / cell)) + 1) for a, b in zip(low, high, strict=True)]
     y = lines[1]
-    for depth in sorted({d for r in tissue.regions if isinstance(r.shape, Layer) for d in (r.shape.top, r.shape.bottom)}):
+    for depth in sorted(
+        {d for r in tissue.regions if isinstance(r.shape, Layer) for d in (r.shape.top, r.shape.bottom)}
+    ):
         if not low[1] < depth < high[1]:
             continue
         nearest = int(np.abs(y - depth).argmin())

@@ -103,7 +103,9 @@ class SpatialFEMResponse:
                 f"Poisson's ratio in space must lie in (-1, 0.5); got {max(ratios)}: take 0.49 for nearly incompressible tissue"
             )
         if len(clamps.points):
-            raise InputError("points cannot be clamped in space by finite elements; clamp a face, or use elastic")
+            raise InputError(
+                "points cannot be clamped in space by finite elements; clamp a face, or use elastic"
+            )
         if not (np.isfinite(radius) and radius > 0):
             raise InputError(f"radius of a force must be a positive number in mm; got {radius}")
         kind = clamps.kind("top")
@@ -120,7 +122,9 @@ class SpatialFEMResponse:
         """Answer unit forces along x, y and z that are spread over places (m, 3) in mm by weights (m,); see `SpatialResponse`."""
         p = as_points(places, "places", 3) if len(places) else np.zeros((0, 3))
         if not self.grid.contains(p).all():
-            raise InputError(f"forces act inside the tissue; got places from {p.min(axis=0)} to {p.max(axis=0)} mm")
+            raise InputError(
+                f"forces act inside the tissue; got places from {p.min(axis=0)} to {p.max(axis=0)} mm"
+            )
         if self.top is not None:  # the image is that of a point: it stays a radius above the surface
             p = p.copy()
             p[:, 1] = np.maximum(p[:, 1], self.radius)
@@ -140,9 +144,7 @@ class SpatialFEMResponse:
             u += self._moves(points, column.places[some], column.weights[some], material)
         return u
 
-    def field_of(
-        self, columns: Sequence[SpatialColumn], forces: Floats
-    ) -> Callable[[Floats], Floats]:
+    def field_of(self, columns: Sequence[SpatialColumn], forces: Floats) -> Callable[[Floats], Floats]:
         """Field under forces (k, 3) in N, one for each column; see `SpatialResponse`."""
         values = np.zeros(3 * self.mesh.size)
         places, loads = [np.zeros((0, 3))], [np.zeros((0, 3))]
@@ -178,7 +180,9 @@ class SpatialFEMResponse:
         if not len(places):
             return {}
         material, which = np.unique(np.stack(self.tissue.at(places), axis=1), axis=0, return_inverse=True)
-        return {(float(E), float(nu)): np.flatnonzero(which.ravel() == k) for k, (E, nu) in enumerate(material)}
+        return {
+            (float(E), float(nu)): np.flatnonzero(which.ravel() == k) for k, (E, nu) in enumerate(material)
+        }
 
     def _scale(self, material: Material) -> float:
         return 1.0 / (16.0 * np.pi * shear_modulus(*material) * (1.0 - material[1]))
@@ -238,8 +242,10 @@ class SpatialFEMResponse:
         mu = shear_modulus(*material)
         for face, (points, normals, index, shares) in self._loose.items():
             G = gradient(points, places, material[1], self.radius, self.top)
-            t = mu * self._scale(material) * np.einsum(
-                "nimk,m->nik", tractions(G, normals, material[1]), weights
+            t = (
+                mu
+                * self._scale(material)
+                * np.einsum("nimk,m->nik", tractions(G, normals, material[1]), weights)
             )
             if self.clamps.kind(face) == "sliding":
                 t[:, SIDES[face][0]] = 0.0
