@@ -16,6 +16,7 @@ if TYPE_CHECKING:  # the menu, loaded on demand
     )
     from echospline.scenario.scenario import LARGEST_FILE, Scenario, describe, load, validated
     from echospline.scenario.sections import DiscSection, ExerciseSection
+    from echospline.scenario.space_scene import is_spatial, open_spatial
 else:
     on_demand(__name__)
 
@@ -30,8 +31,10 @@ __all__ = [
     "check",
     "check_store",
     "describe",
+    "is_spatial",
     "load",
     "needle_doubts",
+    "open_spatial",
     "run",
     "size_doubts",
     "validated",
