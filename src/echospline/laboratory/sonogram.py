@@ -33,6 +33,7 @@ from echospline.scene import (
 )
 
 Singles = NDArray[np.float32]
+Complexes = NDArray[np.complex64]
 SpatialDisplacement = Callable[[Floats], Floats]
 """Displacement (n, 3) in mm at points (n, 3) in mm of undeformed tissue."""
 
@@ -42,12 +43,14 @@ BRICK = (6, 16, 4)
 """Cells (x, y, z) that are stored together, so that a slab is found without testing every scatterer."""
 ABDOMINAL = Transducer(frequency=3.5, bandwidth=0.6, f_number=2.6)
 """3.5 MHz abdominal array."""
-LOOKS = (-12.0, 0.0, 12.0)
-"""Degrees of the beams whose envelopes are averaged; steered less, they are no longer independent."""
+LOOKS = (-8.0, 0.0, 8.0)
+"""Degrees of the beams whose envelopes are averaged. Steered more, shadows of ribs and stones end early; less, looks resemble each other."""
 APERTURE = 30.0
 """mm; largest aperture: below f_number times this, the beam widens with depth."""
 LINE, SAMPLE = 0.25, 0.11
-"""mm; lattice of the echoes. LINE holds the lateral frequencies of beams steered by 12 degrees at 3.5 MHz."""
+"""mm; lattice of the echoes. LINE holds the lateral frequencies of beams steered by up to 15 degrees at 3.5 MHz."""
+COLUMN = 0.6
+"""mm; columns of a face further apart along the picture would be seen singly by the beam."""
 COARSE = (0.75, 0.5)
 """mm (lateral, depth); lattice on which attenuation is summed: shadows have no finer detail."""
 CUT = 2.2
@@ -56,8 +59,12 @@ MARGIN = 3.0
 """mm beside the picture whose echoes reach into it."""
 SIDE_LOBES, SIDE_LOBE_WIDTH = 0.012, 5.0
 """Share of the beam's amplitude in a wide pedestal, and its sigma in mm: it veils fluid and shadows."""
-REVERBERATIONS = ((3.1, -46.0), (5.3, -50.0), (8.2, -50.0), (11.9, -56.0))
-"""mm of delay and dB of repeated echoes: strong reflectors leave a faint trail, so that shadows are not empty."""
+TRAIL, TRAIL_LENGTH = -53.0, 8.0
+"""dB of the reverberation that trails every echo, and mm over which its amplitude falls to 1/e: shadows are not empty."""
+LAG = 7
+"""Samples between the reverberation of one look and of the next."""
+WRAP = 0.8
+"""mm at the lattice's end without echoes: Fourier transforms wrap the pulse around."""
 FLOOR = -58.0
 """dB; electronic noise against speckle of 0 dB at the surface, before the gain over depth."""
 
@@ -87,9 +94,10 @@ class Scattering:
     def of_levels(
         cls, levels: NDArray[np.floating], low: Sequence[float], seed: int, cell: Sequence[float] = CELL
     ) -> Scattering:
-        """Draw scatterers: each anywhere in its cell, of the cell's strength and either sign.
+        """Draw scatterers: each anywhere in its cell, with a strength from a quarter to one and either sign.
 
-        Even strength and one per cell bring few scatterers closer to Rayleigh's distribution than strewn ones.
+        One per cell comes closer to Rayleigh's distribution than as many strewn ones (SNR of the envelope 1.87 there).
+        Of equal strength they overshoot (1.94), of strengths from 0 to 1 they fall short (1.88); Rayleigh is 1.91.
 
         Parameters
         ----------
@@ -118,7 +126,9 @@ class Scattering:
         rng = np.random.default_rng((seed, 1))
         sorted_levels = _bricked(np.asarray(levels, dtype=np.float32), bricks)
         amplitudes = np.exp(sorted_levels * np.float32(log(10.0) / 20.0))
-        amplitudes *= rng.integers(0, 2, sorted_levels.shape, np.int8) * np.float32(2.0) - np.float32(1.0)
+        strength = rng.uniform(-0.75, 0.75, sorted_levels.shape).astype(np.float32)
+        strength += np.copysign(np.float32(0.25), strength)
+        amplitudes *= strength / np.float32(sqrt(0.4375))  # mean square of strengths from 1/4 to 1
         points = np.empty((3, *sorted_levels.shape), dtype=np.float32)
         k, j, i = np.ogrid[:nz, :ny, :nx]
         for axis, index in enumerate((i, j, k)):
@@ -163,7 +173,7 @@ class Faces:
     """
 
     points: Singles
-    amplitudes: NDArray[np.complex64]
+    amplitudes: Complexes
     normals: Singles
     powers: Singles
     cell: tuple[float, float] = (CELL[0], CELL[2])
@@ -276,10 +286,9 @@ class SpatialPhantom:
             Lines and samples in mm: along the probe's face (an arc's length for a curved array) and from it.
         """
         lattice = _Lattice.of(probe, self.transducer, looks)
-        echoes = lattice.empty()
-        self._add_scatterers(echoes, lattice, plane, displacement)
-        self._add_faces(echoes, lattice, plane, displacement)
-        echoes = lattice.with_pulse(echoes.view(np.complex64).reshape(lattice.shape))
+        scattered = lattice.with_pulse(self._scattered(lattice, plane, displacement))
+        reflected = lattice.with_pulse(self._reflected(lattice, plane, displacement))
+        trail = lattice.with_trail(reflected * self._transmission(lattice, plane, 0.0, displacement))
         noise = None
         if floor > -np.inf:
             rng = np.random.default_rng((noise_seed, 2))
@@ -287,10 +296,12 @@ class SpatialPhantom:
             noise *= np.float32(10.0 ** (floor / 20.0) / sqrt(2.0))
         total = np.zeros(lattice.shape, dtype=np.float32)
         for number, look in enumerate(lattice.looks):
-            through = echoes * self._transmission(lattice, plane, look, displacement)
-            for delay, level in REVERBERATIONS:
-                rows = round((delay + 0.7 * number) / SAMPLE)  # looks repeat at other delays: no clean copy
-                through[rows:] += through[:-rows] * np.float32(10.0 ** (level / 20.0))
+            share = self._transmission(lattice, plane, look, displacement)
+            # Each look has its own reverberation and noise; shifting them is as good as drawing them anew.
+            through = reflected * share
+            through[LAG * number :] += trail[: len(trail) - LAG * number]
+            through *= lattice.steering(look)
+            through += scattered * share
             if noise is not None:
                 through += np.roll(noise, 37 * number, axis=0)
             total += np.abs(lattice.with_beam(through, look))
@@ -303,14 +314,10 @@ class SpatialPhantom:
         )
         return np.ascontiguousarray(envelope), grid
 
-    def _add_scatterers(
-        self,
-        echoes: Singles,
-        lattice: _Lattice,
-        plane: ImagingPlane,
-        displacement: SpatialDisplacement | None,
-    ) -> None:
-        """Add the scatterers of the slab."""
+    def _scattered(
+        self, lattice: _Lattice, plane: ImagingPlane, displacement: SpatialDisplacement | None
+    ) -> Complexes:
+        """Put the scatterers of the slab on the lattice."""
         scattering = self.scattering
         chosen = self._bricks_of(lattice, plane, displacement)
         points = scattering.points[:, chosen].reshape(3, -1)
@@ -328,7 +335,7 @@ class SpatialPhantom:
         turn = d * np.float32(lattice.carrier)
         turn -= np.floor(turn)
         turn *= np.float32(-2.0 * pi)
-        lattice.deposit(echoes, q, d, strength * np.cos(turn), strength * np.sin(turn))
+        return lattice.deposited(q, d, strength * np.cos(turn), strength * np.sin(turn))
 
     def _bricks_of(
         self, lattice: _Lattice, plane: ImagingPlane, displacement: SpatialDisplacement | None
@@ -361,31 +368,26 @@ class SpatialPhantom:
         within &= (v + reach_v > probe.top - MARGIN) & (v - reach_v < probe.depth + MARGIN)
         return np.flatnonzero(within)
 
-    def _add_faces(
-        self,
-        echoes: Singles,
-        lattice: _Lattice,
-        plane: ImagingPlane,
-        displacement: SpatialDisplacement | None,
-    ) -> None:
-        """Add the reflecting points of the slab, in phase along a face and once for every look."""
+    def _reflected(
+        self, lattice: _Lattice, plane: ImagingPlane, displacement: SpatialDisplacement | None
+    ) -> Complexes:
+        """Put the reflecting points of the slab on the lattice: in phase along a face, the weaker the more it slants."""
         faces = self.faces
-        if len(faces.points) == 0:
-            return
         points = faces.points.T
         u, v, e = _in_plane(points, plane)
-        _, d, _ = lattice.beam(u, v)
-        reach = CUT * np.sqrt(lattice.slice_variance(d))
-        if displacement is not None:
+        if displacement is not None and points.size:
             points = points + _displaced(displacement, points)
             u, v, e = _in_plane(points, plane)
-        near = np.flatnonzero(np.abs(e) < reach + max(faces.cell))
-        points, normals = points[:, near], faces.normals[near].T
-        # The lattice samples finer along the picture than columns lie: split each column along the face.
-        ax, _, az = plane.matrix[:3, 0]
-        parts = [max(1, ceil(h * abs(a) / LINE)) for h, a in zip(faces.cell, (ax, az), strict=True)]
+        _, d, _ = lattice.beam(u, v)
+        near = np.flatnonzero(np.abs(e) < CUT * np.sqrt(lattice.slice_variance(d)) + max(faces.cell))
+        points, normals, powers = points[:, near], faces.normals[near].T, faces.powers[near]
+        # The beam must not see single columns: split those that lie wide apart along the picture.
+        lateral = np.abs(plane.matrix[:3, 0])
+        parts = [max(1, ceil(h * lateral[i] / COLUMN)) for h, i in zip(faces.cell, (0, 2), strict=True)]
         steep = np.where(np.abs(normals[1]) < 0.3, np.float32(np.inf), normals[1])
         area = faces.cell[0] * faces.cell[1] / (parts[0] * parts[1])
+        n = plane.matrix[:3, :3].T.astype(np.float32) @ normals
+        found = []
         for i, k in np.ndindex(*parts):
             dx = np.float32(((i + 0.5) / parts[0] - 0.5) * faces.cell[0])
             dz = np.float32(((k + 0.5) / parts[1] - 0.5) * faces.cell[1])
@@ -394,16 +396,14 @@ class SpatialPhantom:
             q, d, angle = lattice.beam(u, v)
             variance = lattice.slice_variance(d)
             scale = np.exp(np.float32(-0.5) * e * e / variance) / np.sqrt(np.float32(2 * pi) * variance)
-            spread = lattice.spread(d)
-            n = plane.matrix[:3, :3].T.astype(np.float32) @ normals
-            strength = np.zeros(len(q), dtype=np.complex64)
-            for look in lattice.looks:
-                t = angle + np.float32(look)
-                along = np.abs(n[0] * np.sin(t) + n[1] * np.cos(t)) ** faces.powers[near]
-                turn = np.float32(2.0 * pi * lattice.carrier * sin(look)) * spread * q
-                strength += along * np.exp(1j * turn).astype(np.complex64)
-            strength *= faces.amplitudes[near] * (scale * np.float32(area / LINE) / spread)
-            lattice.deposit(echoes, q, d, strength.real, strength.imag)
+            scale *= np.float32(area / LINE) / lattice.spread(d)
+            along = sum(
+                np.abs(n[0] * np.sin(angle + np.float32(look)) + n[1] * np.cos(angle + np.float32(look))) ** powers
+                for look in lattice.looks
+            )
+            found.append((q, d, faces.amplitudes[near] * (scale * along / np.float32(len(lattice.looks)))))
+        q, d, strength = (np.concatenate(part) for part in zip(*found, strict=True))
+        return lattice.deposited(q, d, strength.real, strength.imag)
 
     def _transmission(
         self,
@@ -503,10 +503,6 @@ class _Lattice:
         weight: Singles = (1.0 / np.sqrt(power)).astype(np.float32)
         return weight
 
-    def empty(self) -> Singles:
-        """Return a lattice without echoes: real and imaginary parts side by side."""
-        return np.zeros((*self.shape, 2), dtype=np.float32)
-
     def spread(self, d: Floats) -> Floats:
         """Return how much wider lines lie at range d than at the face."""
         return 1.0 + np.maximum(d, 0.0) / self.probe.radius if self.probe.shape == "curved" else np.ones_like(d)
@@ -540,36 +536,58 @@ class _Lattice:
         lean: Floats = tan(look) * (d if self.probe.shape == "linear" else r * np.log1p(d / r))
         return lean
 
-    def deposit(self, echoes: Singles, q: Floats, d: Floats, real: Singles, imag: Singles) -> None:
-        """Add echoes between the four samples about each."""
+    def deposited(self, q: Floats, d: Floats, real: Singles, imag: Singles) -> Complexes:
+        """Share echoes between the four samples about each; return the sums."""
         samples, lines = self.shape
         fq = (q - np.float32(self.lines[0])) * np.float32(1.0 / LINE)
         fd = d * np.float32(1.0 / SAMPLE)
-        inside = np.flatnonzero((fq >= 0) & (fq < lines - 1) & (fd >= 0) & (fd < samples - 1))
+        last = samples - 1 - round(WRAP / SAMPLE)
+        inside = np.flatnonzero((fq >= 0) & (fq < lines - 1) & (fd >= 0) & (fd < last))
         fq, fd, real, imag = fq[inside], fd[inside], real[inside], imag[inside]
         i, j = fq.astype(np.int32), fd.astype(np.int32)
         fq -= i
         fd -= j
         first = j * np.int32(lines) + i
         size = samples * lines
-        flat = echoes.reshape(size, 2)
+        echoes = np.zeros(size, dtype=np.complex64)
         for down, row_share in ((0, 1 - fd), (1, fd)):
             for right, share in ((0, row_share * (1 - fq)), (1, row_share * fq)):
                 index = first + np.int32(down * lines + right)
-                flat[:, 0] += np.bincount(index, real * share, size)
-                flat[:, 1] += np.bincount(index, imag * share, size)
+                echoes.real += np.bincount(index, real * share, size)
+                echoes.imag += np.bincount(index, imag * share, size)
+        return echoes.reshape(self.shape)
 
-    def with_pulse(self, echoes: NDArray[np.complex64]) -> NDArray[np.complex64]:
+    def steering(self, look: float) -> Complexes:
+        """Return the phase over the lattice that a steered beam follows: faces are added in phase for every look."""
+        across = self.spread(self.depths if self.probe.shape == "curved" else np.zeros(1))
+        cycles = (self.carrier * sin(look)) * across[:, None] * self.lines
+        phase = ((cycles - np.floor(cycles)) * (2.0 * pi)).astype(np.float32)
+        steering: Complexes = np.cos(phase) + np.complex64(1j) * np.sin(phase)
+        return steering
+
+    def with_pulse(self, echoes: Complexes) -> Complexes:
         """Apply the pulse along depth, of peak 1; the deposit's triangle is undone."""
         sigma = self.transducer.sigma_axial
         k = fft.fftfreq(self.shape[0], SAMPLE)
         gain = np.exp(-2.0 * (pi * sigma * k) ** 2) / np.sinc(k * SAMPLE) ** 2 * (sqrt(2 * pi) * sigma / SAMPLE)
         spectrum = fft.fft(echoes, axis=0, overwrite_x=True)
         spectrum *= gain[:, None].astype(np.float32)
-        shaped: NDArray[np.complex64] = fft.ifft(spectrum, axis=0, overwrite_x=True)
+        shaped: Complexes = fft.ifft(spectrum, axis=0, overwrite_x=True)
         return shaped
 
-    def with_beam(self, echoes: NDArray[np.complex64], look: float) -> NDArray[np.complex64]:
+    def with_trail(self, echoes: Complexes) -> Complexes:
+        """Return the reverberation that follows every echo: a decaying random series, the same for every line."""
+        rows = fft.next_fast_len(self.shape[0] + round(4 * TRAIL_LENGTH / SAMPLE))
+        delay = np.arange(round(4 * TRAIL_LENGTH / SAMPLE)) * SAMPLE
+        series = np.random.default_rng(3).standard_normal((2, len(delay))) * np.exp(-delay / TRAIL_LENGTH)
+        series[:, delay < 1.5] = 0.0  # the echo's own pulse
+        kernel = fft.fft((series[0] + 1j * series[1]) * (10.0 ** (TRAIL / 20.0) / sqrt(2.0)), rows)
+        spectrum = fft.fft(echoes, rows, axis=0)
+        spectrum *= kernel[:, None].astype(np.complex64)
+        trail: Complexes = fft.ifft(spectrum, axis=0, overwrite_x=True)[: self.shape[0]]
+        return trail
+
+    def with_beam(self, echoes: Complexes, look: float) -> Complexes:
         """Apply a beam steered by ``look``, rad: a band of lateral frequencies about carrier sin(look), of unit sum."""
         across = self.spread(self.depths)[:, None].astype(np.float32)
         k = fft.fftfreq(self.shape[1], LINE).astype(np.float32)[None, :]
@@ -583,7 +601,7 @@ class _Lattice:
         band /= np.sinc(k * np.float32(LINE)) ** 2
         spectrum = fft.fft(echoes, axis=1, overwrite_x=True)
         spectrum *= band
-        shaped: NDArray[np.complex64] = fft.ifft(spectrum, axis=1, overwrite_x=True)
+        shaped: Complexes = fft.ifft(spectrum, axis=1, overwrite_x=True)
         return shaped
 
 
