@@ -17,6 +17,7 @@ from scipy import ndimage
 from echospline.scene import Floats
 
 Singles = NDArray[np.float32]
+Numbers = Sequence[float] | Floats
 Coordinates = tuple[Singles, Singles, Singles]
 """x, y and z, broadcastable against each other."""
 
@@ -73,7 +74,7 @@ def lattice(x: Singles, y: Singles, z: Singles) -> Coordinates:
     return x[None, None, :], y[None, :, None], z[:, None, None]
 
 
-def ellipsoid(p: Coordinates, centre: Sequence[float], radii: Sequence[float]) -> Singles:
+def ellipsoid(p: Coordinates, centre: Numbers, radii: Numbers) -> Singles:
     """Approximate the signed distance to an ellipsoid, to first order at its surface."""
     q = [(a - np.float32(c)) / np.float32(r) for a, c, r in zip(p, centre, radii, strict=True)]
     size = np.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
@@ -82,9 +83,7 @@ def ellipsoid(p: Coordinates, centre: Sequence[float], radii: Sequence[float]) -
     return distance
 
 
-def rod(
-    p: Coordinates, start: Sequence[float], end: Sequence[float], first: float, last: float
-) -> Singles:
+def rod(p: Coordinates, start: Numbers, end: Numbers, first: float, last: float) -> Singles:
     """Return the signed distance to a tapering rod between two points, of radius ``first`` to ``last``."""
     a, d = np.asarray(start, np.float32), np.subtract(end, start).astype(np.float32)
     q = [x - y for x, y in zip(p, a, strict=True)]
@@ -201,7 +200,9 @@ class KidneyAnatomy:
         for start, end, first, last in liver_vessels:
             vessel = np.maximum(rod(p, start, end, first, last) + 0.3 * n(p, 3.0, 0), d["liver"] + 1.0)
             d["blood"] = np.minimum(d["blood"], vessel)
-        return {name: np.ascontiguousarray(np.broadcast_to(v, shape), dtype=np.float32) for name, v in d.items()}
+        return {
+            name: np.ascontiguousarray(np.broadcast_to(v, shape), dtype=np.float32) for name, v in d.items()
+        }
 
     def _sinus(self, q: Coordinates) -> Singles:
         """Return the smooth distance to the fat of the sinus."""
@@ -218,7 +219,9 @@ class KidneyAnatomy:
         n = {key: self.noise.on(p, *key)[near] for key in ((3.5, 1), (1.4, 2), (2.5, 3), (2.5, 0), (2.0, 1))}
         sinus = self._sinus(q) + 0.9 * n[3.5, 1] + 0.5 * n[1.4, 2]
         capsule = d["capsule"][near]
-        height = sinus / np.maximum(sinus - capsule, 0.5) + 0.03 * n[2.5, 3]  # 0 at the sinus, 1 at the capsule
+        height = (
+            sinus / np.maximum(sinus - capsule, 0.5) + 0.03 * n[2.5, 3]
+        )  # 0 at the sinus, 1 at the capsule
         pyramid = np.full(sinus.shape, FAR)
         for calyx in self.calyces:
             r = [a - np.float32(b) for a, b in zip(q, calyx.tip, strict=True)]

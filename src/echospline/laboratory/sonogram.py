@@ -34,6 +34,8 @@ from echospline.scene import (
 
 Singles = NDArray[np.float32]
 Complexes = NDArray[np.complex64]
+Reals = NDArray[np.floating]
+"""Coordinates in single or double precision."""
 SpatialDisplacement = Callable[[Floats], Floats]
 """Displacement (n, 3) in mm at points (n, 3) in mm of undeformed tissue."""
 
@@ -114,9 +116,7 @@ class Scattering:
         InputError
             If the cells do not fill whole bricks.
         """
-        if levels.ndim != 3 or any(
-            n % b or n == 0 for n, b in zip(levels.shape[::-1], BRICK, strict=True)
-        ):
+        if levels.ndim != 3 or any(n % b or n == 0 for n, b in zip(levels.shape[::-1], BRICK, strict=True)):
             raise InputError(
                 f"levels have (z, y, x) cells in multiples of {BRICK[::-1]}; got shape {levels.shape}"
             )
@@ -320,7 +320,7 @@ class SpatialPhantom:
         """Put the scatterers of the slab on the lattice."""
         scattering = self.scattering
         chosen = self._bricks_of(lattice, plane, displacement)
-        points = scattering.points[:, chosen].reshape(3, -1)
+        points: Reals = scattering.points[:, chosen].reshape(3, -1)
         amplitudes = scattering.amplitudes[chosen].reshape(-1)
         if displacement is not None and points.size:
             points = points + _displaced(displacement, points)
@@ -355,9 +355,7 @@ class SpatialPhantom:
             )
         u, v, e = _in_plane(centres, plane)
         reach_u, reach_v, reach_e = np.abs(plane.matrix[:3, :3]).T @ (s.size / 2.0) + slack
-        sigma = np.sqrt(
-            np.maximum(lattice.slice_variance(v - reach_v), lattice.slice_variance(v + reach_v))
-        )
+        sigma = np.sqrt(np.maximum(lattice.slice_variance(v - reach_v), lattice.slice_variance(v + reach_v)))
         probe = lattice.probe
         if probe.shape == "curved":  # range grows beside the middle
             d = np.hypot(u, v + probe.radius) - probe.radius
@@ -373,7 +371,7 @@ class SpatialPhantom:
     ) -> Complexes:
         """Put the reflecting points of the slab on the lattice: in phase along a face, the weaker the more it slants."""
         faces = self.faces
-        points = faces.points.T
+        points: Reals = faces.points.T
         u, v, e = _in_plane(points, plane)
         if displacement is not None and points.size:
             points = points + _displaced(displacement, points)
@@ -398,7 +396,8 @@ class SpatialPhantom:
             scale = np.exp(np.float32(-0.5) * e * e / variance) / np.sqrt(np.float32(2 * pi) * variance)
             scale *= np.float32(area / LINE) / lattice.spread(d)
             along = sum(
-                np.abs(n[0] * np.sin(angle + np.float32(look)) + n[1] * np.cos(angle + np.float32(look))) ** powers
+                np.abs(n[0] * np.sin(angle + np.float32(look)) + n[1] * np.cos(angle + np.float32(look)))
+                ** powers
                 for look in lattice.looks
             )
             found.append((q, d, faces.amplitudes[near] * (scale * along / np.float32(len(lattice.looks)))))
@@ -428,7 +427,9 @@ class SpatialPhantom:
         found = ndimage.map_coordinates(a.voxels, index.T[::-1], np.float32, order=1, mode="nearest")
         found[above] = 0.0
         # both ways, dB per step; half a step before a sample lies above it
-        loss = np.cumsum(found.reshape(u.shape), axis=0) * np.float32(2.0 * self.transducer.frequency * dd / 10.0)
+        loss = np.cumsum(found.reshape(u.shape), axis=0) * np.float32(
+            2.0 * self.transducer.frequency * dd / 10.0
+        )
         column = ((lattice.lines - lattice.lean(lattice.depths[:, None], look)) - start[0]) / dq
         row = np.broadcast_to(lattice.depths[:, None] / dd - 0.5, column.shape)
         fine = cv2.remap(
@@ -490,7 +491,11 @@ class _Lattice:
     @property
     def inner(self) -> tuple[slice, int]:
         """Lines without the margin, and number of samples."""
-        face = self.probe.width if self.probe.shape == "linear" else self.probe.radius * radians(self.probe.opening)
+        face = (
+            self.probe.width
+            if self.probe.shape == "linear"
+            else self.probe.radius * radians(self.probe.opening)
+        )
         inside = np.flatnonzero(np.abs(self.lines) <= face / 2 + LINE)
         return slice(inside[0], inside[-1] + 1), ceil(self.probe.depth / SAMPLE) + 1
 
@@ -499,22 +504,26 @@ class _Lattice:
         """Factor that gives scatterers of rms 1, one per cell, speckle of rms 1, for every sample."""
         sz = np.sqrt(self.slice_variance(self.depths))
         across = LINE * self.spread(self.depths)
-        power = across**2 * sqrt(pi) * self.transducer.sigma_axial / (4 * pi * self.sigma * sz) / np.prod(CELL)
+        power = (
+            across**2 * sqrt(pi) * self.transducer.sigma_axial / (4 * pi * self.sigma * sz) / np.prod(CELL)
+        )
         weight: Singles = (1.0 / np.sqrt(power)).astype(np.float32)
         return weight
 
-    def spread(self, d: Floats) -> Floats:
+    def spread(self, d: Reals) -> Reals:
         """Return how much wider lines lie at range d than at the face."""
-        return 1.0 + np.maximum(d, 0.0) / self.probe.radius if self.probe.shape == "curved" else np.ones_like(d)
+        return (
+            1.0 + np.maximum(d, 0.0) / self.probe.radius if self.probe.shape == "curved" else np.ones_like(d)
+        )
 
-    def slice_variance(self, d: Floats) -> Floats:
+    def slice_variance(self, d: Reals) -> Reals:
         """Return the square of the slice's sigma at range d, mm^2: `Probe.thickness` squared, in the type of ``d``."""
         p = self.probe
         off = (np.maximum(d, 0.0) - p.elevation_depth) * (p.element_height / (2.5 * p.elevation_depth))
-        variance: Floats = off * off + p.elevation**2
+        variance: Reals = off * off + p.elevation**2
         return variance
 
-    def beam(self, u: Floats, v: Floats) -> tuple[Floats, Floats, Floats]:
+    def beam(self, u: Reals, v: Reals) -> tuple[Reals, Reals, Reals]:
         """Return line (mm along the face), range (mm) and angle of the line (rad) of points of the plane."""
         if self.probe.shape == "linear":
             return u, v, np.zeros_like(u)
@@ -522,7 +531,7 @@ class _Lattice:
         angle = np.arctan2(u, v + r)
         return r * angle, np.hypot(u, v + r) - r, angle
 
-    def place(self, q: Floats, d: Floats) -> tuple[Floats, Floats]:
+    def place(self, q: Reals, d: Reals) -> tuple[Reals, Reals]:
         """Invert `beam`: return the points of the plane on line q at range d."""
         if self.probe.shape == "linear":
             u, v = np.broadcast_arrays(q, d)
@@ -530,13 +539,13 @@ class _Lattice:
         r = self.probe.radius
         return (r + d) * np.sin(q / r), (r + d) * np.cos(q / r) - r
 
-    def lean(self, d: Floats, look: float) -> Floats:
+    def lean(self, d: Reals, look: float) -> Reals:
         """Return how far a steered beam has left its line at range d, mm along the face."""
         r = self.probe.radius
-        lean: Floats = tan(look) * (d if self.probe.shape == "linear" else r * np.log1p(d / r))
+        lean: Reals = tan(look) * (d if self.probe.shape == "linear" else r * np.log1p(d / r))
         return lean
 
-    def deposited(self, q: Floats, d: Floats, real: Singles, imag: Singles) -> Complexes:
+    def deposited(self, q: Reals, d: Reals, real: Singles, imag: Singles) -> Complexes:
         """Share echoes between the four samples about each; return the sums."""
         samples, lines = self.shape
         fq = (q - np.float32(self.lines[0])) * np.float32(1.0 / LINE)
@@ -569,7 +578,9 @@ class _Lattice:
         """Apply the pulse along depth, of peak 1; the deposit's triangle is undone."""
         sigma = self.transducer.sigma_axial
         k = fft.fftfreq(self.shape[0], SAMPLE)
-        gain = np.exp(-2.0 * (pi * sigma * k) ** 2) / np.sinc(k * SAMPLE) ** 2 * (sqrt(2 * pi) * sigma / SAMPLE)
+        gain = (
+            np.exp(-2.0 * (pi * sigma * k) ** 2) / np.sinc(k * SAMPLE) ** 2 * (sqrt(2 * pi) * sigma / SAMPLE)
+        )
         spectrum = fft.fft(echoes, axis=0, overwrite_x=True)
         spectrum *= gain[:, None].astype(np.float32)
         shaped: Complexes = fft.ifft(spectrum, axis=0, overwrite_x=True)
@@ -605,13 +616,14 @@ class _Lattice:
         return shaped
 
 
-def _in_plane(points: Floats, plane: ImagingPlane) -> tuple[Floats, Floats, Floats]:
+def _in_plane(points: Reals, plane: ImagingPlane) -> tuple[Reals, Reals, Reals]:
     """Return lateral position, depth and distance (mm) of points (3, n) from the plane, in their own type."""
     m = plane.matrix.astype(points.dtype)
     x, y, z = points
     (ox, oy, oz), r = m[:3, 3], m[:3, :3]
     u, v, e = (
-        x * r[0, i] + y * r[1, i] + z * r[2, i] - (ox * r[0, i] + oy * r[1, i] + oz * r[2, i]) for i in range(3)
+        x * r[0, i] + y * r[1, i] + z * r[2, i] - (ox * r[0, i] + oy * r[1, i] + oz * r[2, i])
+        for i in range(3)
     )
     return u, v, e
 
@@ -624,14 +636,14 @@ def _beam_coordinates(probe: Probe, points: Floats) -> tuple[Floats, Floats]:
     return probe.radius * np.arctan2(x, y + probe.radius), np.hypot(x, y + probe.radius) - probe.radius
 
 
-def _displaced(displacement: SpatialDisplacement, points: Floats) -> Floats:
+def _displaced(displacement: SpatialDisplacement, points: Reals) -> Reals:
     """Return the displacement of points (3, n), in their shape and type."""
     u = np.asarray(displacement(np.ascontiguousarray(points.T, dtype=np.float64)))
     if u.shape != (points.shape[1], 3) or not np.isfinite(u).all():
         raise InputError(
             f"a displacement gives three finite numbers in mm per point, shape {(points.shape[1], 3)}; got shape {u.shape}"
         )
-    moved: Floats = u.T.astype(points.dtype)
+    moved: Reals = u.T.astype(points.dtype)
     return moved
 
 
