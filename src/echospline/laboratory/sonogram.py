@@ -55,8 +55,8 @@ COLUMN = 0.6
 """mm; columns of a face further apart along the picture would be seen singly by the beam."""
 COARSE = (0.75, 0.5)
 """mm (lateral, depth); lattice on which attenuation is summed: shadows have no finer detail."""
-CUT = 2.2
-"""Sigmas of the slice beyond which scatterers are left out; they hold 0.2 % of its energy."""
+CUT = 2.5
+"""Sigmas of the slice beyond which scatterers are left out; fewer make neighbouring planes less alike than their beams are."""
 MARGIN = 3.0
 """mm beside the picture whose echoes reach into it."""
 SIDE_LOBES, SIDE_LOBE_WIDTH = 0.012, 5.0
