@@ -81,13 +81,13 @@ ECHOSPLINE_API const char* echospline_level_name(int32_t level);
 
 /* ---- Scene -------------------------------------------------------------------------------------------------------- */
 
-enum { ECHOSPLINE_THIN_PLATE = 0, ECHOSPLINE_ELASTIC = 1 };        /* kernel */
-enum { ECHOSPLINE_SINGLE = 0, ECHOSPLINE_DOUBLE = 1 };             /* precision of the field */
-enum { ECHOSPLINE_TIP_POINT = 0, ECHOSPLINE_TIP_NODE = 1 };        /* landmark of the tip */
+enum { ECHOSPLINE_THIN_PLATE = 0, ECHOSPLINE_ELASTIC = 1 };                     /* kernel */
+enum { ECHOSPLINE_SINGLE = 0, ECHOSPLINE_DOUBLE = 1 };                          /* precision of the field */
+enum { ECHOSPLINE_TIP_POINT = 0, ECHOSPLINE_TIP_NODE = 1 };                     /* landmark of the tip */
 enum { ECHOSPLINE_FOLLOW = 0, ECHOSPLINE_IMMEDIATE = 1, ECHOSPLINE_STICK = 2 }; /* loading */
-enum { ECHOSPLINE_PLANE_STRESS = 0, ECHOSPLINE_PLANE_STRAIN = 1 }; /* elastic kernel in the plane */
-enum {                                                             /* edges (2-D) or faces (3-D), bits */
-       ECHOSPLINE_LEFT = 1,                                        /* least x */
+enum { ECHOSPLINE_PLANE_STRESS = 0, ECHOSPLINE_PLANE_STRAIN = 1 };              /* elastic kernel in the plane */
+enum {                                                                          /* edges (2-D) or faces (3-D), bits */
+       ECHOSPLINE_LEFT = 1,                                                     /* least x */
        ECHOSPLINE_RIGHT = 2,
        ECHOSPLINE_TOP = 4, /* least y: at the probe */
        ECHOSPLINE_BOTTOM = 8,
@@ -125,7 +125,7 @@ typedef struct echospline_scene_options {
   int64_t contact_room;    /* contacts for which memory is reserved; 0 chooses. More are possible and allocate once. */
   uint32_t sliding; /* edges that move along themselves alone, without friction: bits as `clamped`. Others are free. */
   uint32_t reserved;
-  double friction_speed;   /* speed at which equation (15) says how far friction holds tissue that sticks, mm/s */
+  double friction_speed; /* speed at which equation (15) says how far friction holds tissue that sticks, mm/s */
 } echospline_scene_options;
 
 typedef struct echospline_scene echospline_scene;
