@@ -55,3 +55,9 @@ class LoadedModel(Protocol):
 def needle_load(model: object, state: object) -> NeedleLoad | None:
     """Return the needle's forces in a state of any model; None where the model has none (landmarks)."""
     return model.needle_load(state) if isinstance(model, LoadedModel) else None
+
+
+def described(model: object) -> str:
+    """Return in one sentence how a model solves the tissue; empty where the model's name says it all (landmarks)."""
+    describe = getattr(model, "describe", None)
+    return str(describe()) if callable(describe) else ""
