@@ -255,13 +255,13 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_info_knows_the_folder_of_a_run_and_its_report(results: Path) -> None:
     for name in (results, results / "run.json"):
         about = describe(str(name))
-        assert about["model"] == "tps"
+        assert about["model"] == "green"
         assert about["frames"] == 2
         assert "cine.mp4" in about["files"]
         said = json.loads((results / "run.json").read_text())
         assert about["notes"] == said["image"]["notes"] + said["doubts"]
         assert any("4.8 mm deep" in note for note in about["notes"])
-        assert "tps" in told("info", name)
+        assert "green" in told("info", name)
 
 
 def test_info_says_which_results_are_gone_or_unfinished(results: Path, tmp_path: Path) -> None:

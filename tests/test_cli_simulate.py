@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import os
 import signal
@@ -16,7 +17,8 @@ from PIL import Image
 
 from echospline.atomic import LOCK
 from echospline.io import read, read_displacement
-from echospline.mechanics import describe_core
+from echospline.mechanics import NeoHookeanModel, describe_core
+from echospline.mechanics.finite_elements import METHOD
 from echospline.scenario import load
 
 SMALL = [
@@ -186,3 +188,61 @@ def test_help_reads_like_a_manual():
     answer = echospline("simulate", "--help")
     for words in ("--entry", "mm", "range", "default", "--no-retract", "--alpha3", "1/s"):
         assert words in answer.stdout
+
+
+def test_green_goes_on_when_the_tip_leaves_the_picture_and_comes_back(tmp_path):
+    out, run = tmp_path / "out", ["--no-figure", "--fps", "10", "--mesh", "20x15", "--dwell", "0"]
+    answer = echospline(
+        *["simulate", "sample:calf", "--entry", "40,0", "--angle", "50", "--out", str(out), *run]
+    )
+    assert answer.returncode == 0, answer.stderr
+    record = read_displacement(out / "displacement.npz")
+    assert record.tip[:, 0].max() > 50.0  # the picture is 49.8 mm wide
+    assert np.hypot(*record.displacement[-1].T).max() < 0.05  # out again
+
+
+def test_a_run_says_how_green_solved_the_tissue_and_what_it_doubts(tmp_path):
+    scenario = tmp_path / "lesion.toml"
+    scenario.write_text(
+        "[mesh]\nnodes = [20, 15]\n[needle]\nentry = [12.0, 0.0]\nangle = 60.0\ndepth = 20.0\n"
+        "[[tissue.region]]\nyoung = 40.0\ncircle = { centre = [22.0, 17.0], radius = 5.0 }\n"
+        '[output]\nfps = 10.0\nfigure = false\nformats = ["png"]\n'
+    )
+    answer = echospline(*["simulate", str(scenario), "--out", str(tmp_path / "out"), "--json"])
+    assert answer.returncode == 0, answer.stderr
+    report = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert report["solved_by"].startswith("Green's function, regions: ")
+    assert any("from an edge or interface" in doubt for doubt in report["doubts"])
+    assert "UserWarning" not in answer.stderr
+    assert "echospline: doubt: a force at" in answer.stderr
+    assert "echospline: note: Green's function, regions" in answer.stderr
+
+
+def test_neo_hookean_tissue_needs_no_extra_and_says_its_forces(tmp_path):
+    run = [
+        "--model",
+        "fem",
+        "--material",
+        "neo-hookean",
+        "--mesh",
+        "12x9",
+        "--fps",
+        "5",
+        "--depth",
+        "8",
+        "--no-figure",
+    ]
+    answer = echospline(*["simulate", "sample:calf", "--out", str(tmp_path), *run])
+    assert answer.returncode == 0, answer.stderr
+    report = json.loads((tmp_path / "run.json").read_text())
+    assert report["largest_forces"]["tip_force_N"] == pytest.approx(0.4)
+    assert "neo-Hookean" in report["solved_by"]
+    assert inspect.signature(NeoHookeanModel).parameters["solver"].default == METHOD
+
+
+def test_no_edge_is_said_by_none(tmp_path):
+    answer = echospline(
+        *["simulate", "sample:calf", "--clamped", "none", "--sliding", "none", "--out", str(tmp_path)]
+    )
+    assert answer.returncode == 2
+    assert "no edge" in answer.stderr

@@ -151,7 +151,7 @@ def test_doubts_are_said_and_kept_in_the_report(picture, tmp_path):
         "simulate", picture, "--spacing", "0.1,0.1", *QUICK, "--entry", "900,0", "--out", tmp_path, "--json"
     )
     assert done.returncode == 0, done.stderr
-    (line,) = done.stderr.splitlines()
+    (line,) = (said for said in done.stderr.splitlines() if ": doubt: " in said)
     assert line.startswith("echospline: doubt: the needle never meets the tissue")
     assert json.loads(done.stdout)["doubts"] == [line.removeprefix("echospline: doubt: ")]
 

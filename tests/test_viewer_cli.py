@@ -83,8 +83,11 @@ def test_live_serves_the_page_and_the_real_model_and_ends_when_told(tmp_path):
                     *(m for m in MODELS if m != "green"),
                 ]
                 entry = tuple(client.hello["pose"]["entry"])
-                frame = client.until(lambda f: f.largest > 0.2, (*entry, 50.0, 8.0), timeout=90)
-                assert frame.flags & SPLINE  # landmarks and weights, not nodes
+                client.ask(do="model", name="tps")
+                frame = client.until(
+                    lambda f: f.flags & SPLINE and f.largest > 0.2, (*entry, 50.0, 8.0), timeout=90
+                )
+                assert frame.spline is not None  # landmarks and weights, not nodes
                 client.ask(do="model", name="fem")
                 frame = client.until(lambda f: not f.flags & SPLINE, timeout=90)
                 assert frame.displacement.shape == (12 * 9, 2)
@@ -118,7 +121,7 @@ def test_a_tracker_that_is_lost_is_said_on_the_page_of_live_with_its_link(tmp_pa
                 assert client.until(lambda f: True).tip[1] > 7.0
                 tracker.sendall(encode(Message(Transform(tip), "NeedleTipToReference")))
                 assert client.hear("tracker")["text"] == ""
-                assert "silent for 1.5 s" in client.hear("tracker")["text"]
+                assert re.search(r"silent for 1\.\d s", client.hear("tracker")["text"])
         finally:
             process.send_signal(signal.SIGINT)
             assert process.wait(60) == 0

@@ -29,7 +29,16 @@ from echospline.menu import on_demand
 if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.errors import EchosplineError, FoldingError, InputError, MissingExtraError, SolverError
     from echospline.io import open_cine, open_writer, read, read_displacement, read_image, sample_image
-    from echospline.mechanics import Elastic, FEMModel, NeedleForces, ThinPlate, TPSModel, TPSParameters
+    from echospline.mechanics import (
+        Elastic,
+        FEMModel,
+        GreenModel,
+        NeedleForces,
+        ThinPlate,
+        TPSModel,
+        TPSParameters,
+        ViscousForces,
+    )
     from echospline.mechanics.protocol import TissueModel
     from echospline.picture import Deformation, Frame, NeedleEcho, simulate, warp
     from echospline.scenario import Scenario
@@ -46,6 +55,7 @@ __all__ = [
     "FEMModel",
     "FoldingError",
     "Frame",
+    "GreenModel",
     "InputError",
     "Insertion",
     "MissingExtraError",
@@ -61,6 +71,7 @@ __all__ = [
     "Tissue",
     "TissueModel",
     "UltrasoundImage",
+    "ViscousForces",
     "load_scenario",
     "open_cine",
     "open_writer",

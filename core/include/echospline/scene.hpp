@@ -35,7 +35,8 @@ struct Scene {
   AnchoredKernel<D> anchored;
   Array<double> stiffness;  ///< per node; empty: infinite
   Array<Vec<D>> source;     ///< rest position of every source, mm
-  Array<double> clearance;  ///< distance of every source to what is clamped, mm; beside a sliding edge tissue can follow
+  Array<double>
+      clearance;  ///< distance of every source to what is clamped, mm; beside a sliding edge tissue can follow
   SceneField<D>* field = nullptr;
   int64_t contact_room = 0;
   uint64_t fingerprint = 0;  ///< of everything that a state depends on

@@ -16,11 +16,11 @@
 
 namespace echospline::ECHOSPLINE_CORE {
 
-constexpr int MOST_STATIONS = 512;      // of a track: 640 mm at the usual spacing
-constexpr int MOST_SLIP_SUBSTEPS = 400;      // of a step; a needle that jumps further is solved in longer ones
-constexpr int MOST_REPEATS = 20;        // solutions of a substep, while front, cover and displacement come to agree
-constexpr double AGREED = 1e-7;         // mm; front and cover agree when they change by less
-constexpr double LEAST_CONTACT = 1e-9;  // mm; a piece that is covered less than this is not touched
+constexpr int MOST_STATIONS = 512;       // of a track: 640 mm at the usual spacing
+constexpr int MOST_SLIP_SUBSTEPS = 400;  // of a step; a needle that jumps further is solved in longer ones
+constexpr int MOST_REPEATS = 20;         // solutions of a substep, while front, cover and displacement come to agree
+constexpr double AGREED = 1e-7;          // mm; front and cover agree when they change by less
+constexpr double LEAST_CONTACT = 1e-9;   // mm; a piece that is covered less than this is not touched
 constexpr double RUN_AHEAD = 1.5;  // travels of the needle that the front may advance in a substep: see the Python file
 constexpr double SPRING_BACK = 1.0;       // travels of the needle that a station may spring back in a substep
 constexpr double SAME_AXIS = 1e-9;        // axes that differ by less are one axis

@@ -7,7 +7,7 @@ namespace echospline::ECHOSPLINE_CORE {
 
 constexpr double SAME_PLACE =
     1e-6;  // mm; a tip closer than this to a contact replaces it as landmark, and to what is clamped pushes nothing
-constexpr double PARALLEL = 1e-12;   // sine of the angle below which a shaft runs along a line of nodes
+constexpr double PARALLEL = 1e-12;  // sine of the angle below which a shaft runs along a line of nodes
 
 /// A node that is a landmark: it touches the needle, or has left it and relaxes.
 template <int D>
@@ -411,7 +411,8 @@ class Tissue {
     if (p.sigma <= 0) return none;
     if (p.on_node || p.immediate) return clearance > 0 && advancing && can_move ? given : none;
     const bool back = !before.present || before.pushed || norm(n.tip - before.place) <= larger(n.travel, LET_GO);
-    if (!(advancing && clearance > SAME_PLACE && clear_of_leaving(n.tip) && back)) return before.present ? leaves : none;
+    if (!(advancing && clearance > SAME_PLACE && clear_of_leaving(n.tip) && back))
+      return before.present ? leaves : none;
     return before.present || n.speed > 0 ? follows : none;
   }
   /// A tip that begins to push into tissue where nodes still relax waits until they are gone: two landmarks in one place would tear the field.

@@ -20,9 +20,16 @@ class Volume {
       scale_[k] = 1.0 / options.spacing[k];
       origin_[k] = options.origin[k];
     }
-    const int64_t layer = int64_t(shape_[0]) * shape_[1];
-    if (!words_.reserve(layer * shape_[2])) return false;
-    for (int z = 0; z < shape_[2]; ++z) pack(voxels + z * layer, 1, 0, shape_[0], shape_[1], words_.data() + z * layer);
+    for (int k = 0; k < 2; ++k) bricks_[k] = (shape_[k] + SIDE - 1) / SIDE;
+    const int64_t layer = int64_t(shape_[0]) * shape_[1], deep = (shape_[2] + SIDE - 1) / SIDE;
+    Array<uint32_t> packed;
+    if (!packed.reserve(layer) || !words_.reserve(int64_t(bricks_[0]) * bricks_[1] * deep * (SIDE * SIDE * SIDE)))
+      return false;
+    for (int z = 0; z < shape_[2]; ++z) {
+      pack(voxels + z * layer, 1, 0, shape_[0], shape_[1], packed.data());
+      for (int y = 0; y < shape_[1]; ++y)
+        for (int x = 0; x < shape_[0]; ++x) words_[index_of(x, y, z)] = packed[int64_t(y) * shape_[0] + x];
+    }
     return true;
   }
 

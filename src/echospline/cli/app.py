@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import warnings
 from importlib import import_module
 from typing import Annotated, Any, TextIO
 
@@ -94,11 +95,18 @@ def echospline(
     """Simulate, in real time, how an ultrasound image deforms while a needle is pushed into the tissue."""
 
 
+def _say_warning(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+    """Print what a model warns of as one sentence; of other packages' warnings users can make nothing."""
+    if issubclass(category, UserWarning):
+        print(f"echospline: doubt: {message}", file=sys.stderr)
+
+
 def main() -> None:
     """Run the command line; bad input ends with one sentence on stderr and exit code 2.
 
     A reader that closes the pipe early (``| head``) has what it wanted: the command then ends with 0, quietly.
     """
+    warnings.showwarning = _say_warning
     out, file = sys.stdout, _file_of(sys.stdout)
     code: str | int | None
     try:

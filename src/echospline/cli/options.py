@@ -82,7 +82,7 @@ OPTIONS = (
     Option("--region", "image.region", "L,T,R,B", integers, "Image"),
     Option("--window", "image.window", "LOW,HIGH", _numbers, "Image"),
     Option("--mesh", "mesh.nodes", "NXxNY", _nodes, "Mesh"),
-    Option("--clamped", "mesh.clamped", "EDGE,...", _words, "Mesh"),
+    Option("--clamped", "mesh.clamped", "EDGE,...|none", _edges, "Mesh"),
     Option("--sliding", "mesh.sliding", "EDGE,...|none", _edges, "Mesh"),
     Option("--entry", "needle.entry", "X,Y", _numbers),
     Option("--angle", "needle.angle", "DEG"),

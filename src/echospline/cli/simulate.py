@@ -89,6 +89,9 @@ def simulate_into(source: str, out: Path, changes: dict[str, Any], *, as_json: b
             form_image=_image_former(scenario, image),
             doubts=doubts,
         )
+    if scenario.model.kind == "green":
+        say([report["solved_by"]], "note")
+    say(doubt for doubt in report["doubts"] if doubt not in doubts)
     if as_json:
         json.dump(report, sys.stdout, indent=2)
         print()

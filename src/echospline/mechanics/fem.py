@@ -173,6 +173,10 @@ class FEMModel:
             return NeedleLoad()
         return NeedleLoad(state.tip, float(np.sum(state.friction @ np.array(state.pose.axis))))
 
+    def describe(self) -> str:
+        """Return in one sentence how the tissue is solved, and how far that is to be trusted."""
+        return self.response.describe()
+
     def loads(self, state: State) -> Floats:
         """Nodal loads (n, 2) in N that act on the tissue in a state."""
         if isinstance(state, FEMState):

@@ -152,9 +152,8 @@ class GreenModel:
         check_step(dt)
         if self.needle is not None and isinstance(state, ForceState):
             after = self.needle.advance(state, pose, dt)
-            if after.load.tip > 0 and len(after.track) != len(
-                state.track
-            ):  # the tip has come to another place
+            moved_on = len(after.track) != len(state.track)
+            if moved_on and after.load.tip > 0 and self.grid.contains(pose.tip)[0]:
                 self._warn(np.array([pose.tip]), after.load.tip * np.array([pose.axis]))
             return after
         law = self.forces
@@ -211,6 +210,10 @@ class GreenModel:
         if state.pose is None:
             return NeedleLoad()
         return NeedleLoad(state.tip, float(state.friction @ self.stations(state.pose)[1]))
+
+    def describe(self) -> str:
+        """Return in one sentence how the tissue is solved, and how far that is to be trusted."""
+        return self.response.describe()
 
     def stations(self, pose: NeedlePose) -> tuple[Floats, Floats]:
         """Points (k, 2) of the shaft that carry friction, mm, and the length (k,) in mm that each stands for."""

@@ -24,6 +24,7 @@ from echospline.errors import InputError, SolverError
 from echospline.mechanics.cut_cells import elements_of
 from echospline.mechanics.fem_response import refuse_loose
 from echospline.mechanics.finite_elements import (
+    METHOD,
     MPA,
     Method,
     element_centres,
@@ -90,9 +91,7 @@ class NeoHookean:
         If the mesh, what holds it, or a modulus does not make a solvable system.
     """
 
-    def __init__(
-        self, grid: RegularGrid, clamps: Clamps, tissue: Tissue, *, solver: Method = "cholmod"
-    ) -> None:
+    def __init__(self, grid: RegularGrid, clamps: Clamps, tissue: Tissue, *, solver: Method = METHOD) -> None:
         refuse_loose(grid, clamps)
         self.grid, self.clamps, self.tissue, self.solver = grid, clamps, tissue, solver
         self._elements = element_nodes(grid)

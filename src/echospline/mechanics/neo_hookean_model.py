@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from echospline.mechanics.fem import FEMModel
-from echospline.mechanics.finite_elements import Method, interpolate
+from echospline.mechanics.finite_elements import METHOD, Method, interpolate
+from echospline.mechanics.forces import NeedleLoad
 from echospline.mechanics.neo_hookean import Equilibrium, NeoHookean
 from echospline.scene import Floats, NeedlePose, RegularGrid
 
@@ -49,7 +50,7 @@ class NeoHookeanModel:
         If Poisson's ratio is negative.
     """
 
-    def __init__(self, linear: FEMModel, *, solver: Method = "cholmod") -> None:
+    def __init__(self, linear: FEMModel, *, solver: Method = METHOD) -> None:
         self.linear = linear
         response = linear.response
         self.material = NeoHookean(response.grid, response.clamps, response.tissue, solver=solver)
@@ -80,6 +81,14 @@ class NeoHookeanModel:
     def displacement(self, state: NeoHookeanState) -> Floats:
         """Displacement of the nodes, shape (n, 2), mm."""
         return state.equilibrium.displacement
+
+    def describe(self) -> str:
+        """Return in one sentence how the tissue is solved."""
+        return f"neo-Hookean tissue, Newton's method on {self.linear.describe()}"
+
+    def needle_load(self, state: NeoHookeanState) -> NeedleLoad:
+        """Return the needle's forces on the tissue: those of the linear model, which act here too."""
+        return self.linear.needle_load(state.linear)
 
     def displacement_at(self, state: NeoHookeanState, points: ArrayLike) -> Floats:
         """Displacement of any reference points of the mesh, equation (22), shape (n, 2), mm."""

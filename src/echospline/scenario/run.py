@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
+import warnings
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -20,7 +21,7 @@ from echospline.atomic import appearing, writing
 from echospline.io import DisplacementWriter, open_writer
 from echospline.io.sequence import SequenceWriter
 from echospline.mechanics import describe_core
-from echospline.mechanics.protocol import NeedleLoad, State, TissueModel
+from echospline.mechanics.protocol import NeedleLoad, State, TissueModel, described
 from echospline.picture import Frame, ImageFormer, frame_count, simulate
 from echospline.scenario.scenario import Scenario
 from echospline.scene import UltrasoundImage
@@ -130,6 +131,8 @@ def run(
     with ExitStack() as stack:
         # matrices of a few hundred rows: starting a second thread costs more than it saves
         stack.enter_context(threadpool_limits(limits=1, user_api="blas"))
+        heard = stack.enter_context(warnings.catch_warnings(record=True))
+        warnings.simplefilter("always", UserWarning)
         sinks = []
         for name in dict.fromkeys(output.formats):
             files.append(SUFFIX[name])
@@ -188,13 +191,14 @@ def run(
             "notes": list(image.notes),
         },
         "model": scenario.model.kind,
+        **({"solved_by": solved} if (solved := described(model)) else {}),
         "mesh_nodes": model.grid.size,
         "frames": count,
         "largest_displacement_mm": tally.largest,
         **({"largest_forces": tally.forces} if tally.forces else {}),
         "inverse_map_residual_px": tally.residual,
         "folded_frames": tally.folded,
-        "doubts": list(doubts),
+        "doubts": [*doubts, *dict.fromkeys(str(w.message) for w in heard if w.category is UserWarning)],
         "milliseconds_per_frame": {
             name: {
                 "median": float(np.median(ms)),

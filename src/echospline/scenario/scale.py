@@ -55,6 +55,10 @@ _FEM_BYTES = 6_500
 """Memory of finite elements per node: measured from 10 000 to 160 000 nodes, factor and assembly."""
 _STEP, _FEM_STEP = 7e-4, 1e-6
 """s per step of the model, and per step and node of finite elements; measured on one core, orders of magnitude."""
+_STATION_BYTES = 48.0
+"""Memory of a station's columns per node: single precision, kept by the model and by the core, and once more while it is answered."""
+_COLUMN, _ANSWER = 2e-9, 4e-7
+"""s per step, node and station to add up columns, and per node and station to be answered; orders of magnitude."""
 _PIXEL, _WRITE, _FORMED = 1e-8, 3e-8, 5e-6
 """s per pixel and frame to draw, to write one format, and to form a picture of scatterers."""
 
@@ -170,14 +174,19 @@ def cost_of(scenario: Scenario, image: UltrasoundImage) -> Cost:
     )
     fem = scenario.model.kind == "fem"
     per_step = _STEP + _FEM_STEP * nodes * fem
+    # forces that stick act at stations of the track, each with its columns: here, and in the core
+    insertion = scenario.insertion()
+    deepest = float(np.hypot(*(insertion.tip - insertion.entry).T).max())
+    sticks = scenario.model.kind in ("fem", "green") and scenario.model.forces.law == "stick-slip"
+    stations = deepest / scenario.model.forces.station_spacing * sticks
     formed = output.image_model == "rescatter" or scenario.image.file == PHANTOM
     per_frame = image.grid.size * (_PIXEL + _WRITE * len(output.formats) + _FORMED * formed)
     return Cost(
         frames,
         steps,
         on_disk,
-        8.0 * pixels + nodes * (_FEM_BYTES if fem else 400.0),
-        steps * per_step + frames * per_frame,
+        8.0 * pixels + nodes * ((_FEM_BYTES if fem else 400.0) + _STATION_BYTES * stations),
+        steps * (per_step + _COLUMN * nodes * stations) + _ANSWER * nodes * stations + frames * per_frame,
     )
 
 

@@ -108,7 +108,7 @@ class Scenario(Section):
             *tables, last = key.split(".")
             table = tree
             for name in tables:
-                if table.get(name, 0) is None:  # a table that is not there yet: [space]
+                if table.get(name) is None:  # a table that is not there yet: [space]
                     table[name] = {}
                 table = table[name]
             table[last] = value
