@@ -20,7 +20,7 @@ from echospline.scene import Floats, Layer, SpatialGrid, Tissue
 
 GAUSS = 3
 """Points per direction: exact for the energy of a cell of one modulus."""
-FINE_GAUSS = 6
+FINE_GAUSS = 5
 """Points per direction in a cell of more than one modulus."""
 MOST_NODES = 40_000
 """Of a mesh that is factored: fill-in grows with the 4/3rd power, and this many take gigabytes and minutes."""
@@ -43,7 +43,9 @@ def lines_for(grid: SpatialGrid, tissue: Tissue, cell: float) -> tuple[Floats, F
     low, high = grid.corners
     lines = [np.linspace(a, b, max(1, round((b - a) / cell)) + 1) for a, b in zip(low, high, strict=True)]
     y = lines[1]
-    for depth in sorted({d for r in tissue.regions if isinstance(r.shape, Layer) for d in (r.shape.top, r.shape.bottom)}):
+    for depth in sorted(
+        {d for r in tissue.regions if isinstance(r.shape, Layer) for d in (r.shape.top, r.shape.bottom)}
+    ):
         if not low[1] < depth < high[1]:
             continue
         nearest = int(np.abs(y - depth).argmin())
@@ -196,9 +198,7 @@ class Hexahedra:
 
     def moduli(self, points: Floats) -> tuple[Floats, Floats]:
         """Lamé's parameters at points (..., 3), N/mm^2."""
-        young, poisson = self.tissue.at(points.reshape(-1, 3))
-        lam, mu = lame(young, poisson, "strain")
-        return MPA * lam.reshape(points.shape[:-1]), MPA * mu.reshape(points.shape[:-1])
+        return _lame_at(self.tissue, points)
 
     @cached_property
     def _free(self) -> NDArray[np.bool_]:
@@ -244,9 +244,10 @@ class Hexahedra:
                 if not len(some):
                     continue
                 volume, shear = _energies(size[some[0]], FINE_GAUSS if fine else GAUSS)
-                l, m = (finer[0][some], finer[1][some]) if fine else (lam[some], mu[some])
+                at_points = (finer[0][some], finer[1][some]) if fine else (lam[some], mu[some])
                 q = volume.shape[0]
-                entries[some] = (l @ volume.reshape(q, -1) + m @ shear.reshape(q, -1)).reshape(-1, 81, 81)
+                energy = at_points[0] @ volume.reshape(q, -1) + at_points[1] @ shear.reshape(q, -1)
+                entries[some] = energy.reshape(-1, 81, 81)
         dofs = (3 * self.cells[:, :, None] + np.arange(3)).reshape(-1, 81)
         rows, columns = np.repeat(dofs, 81, axis=1).ravel(), np.tile(dofs, (1, 81)).ravel()
         K: sparse.csc_matrix = sparse.coo_matrix(

@@ -96,9 +96,7 @@ class SpatialResponse(Protocol):
         """Displacement of points (p, 3) in mm by unit forces, shape (p, 3, 3), mm/N: the last axis is the force's direction."""
         ...
 
-    def field_of(
-        self, columns: Sequence[SpatialColumn], forces: Floats
-    ) -> Callable[[Floats], Floats]:
+    def field_of(self, columns: Sequence[SpatialColumn], forces: Floats) -> Callable[[Floats], Floats]:
         """Displacement (n, 3) in mm of any points (n, 3) in mm under forces (k, 3) in N, one for each column."""
         ...
 

@@ -243,7 +243,9 @@ class SpaceResponse:
         """Answer unit forces along x, y and z that are spread over places (m, 3) in mm by weights (m,); see `SpatialResponse`."""
         p = as_points(places, "places", 3) if len(places) else np.zeros((0, 3))
         if not self.grid.contains(p).all():
-            raise InputError(f"forces act inside the tissue; got places from {p.min(axis=0)} to {p.max(axis=0)} mm")
+            raise InputError(
+                f"forces act inside the tissue; got places from {p.min(axis=0)} to {p.max(axis=0)} mm"
+            )
         p = self._below(p)
         return SpatialColumn(p, weights, self._answers(p, weights[:, None, None] * np.eye(3)))
 

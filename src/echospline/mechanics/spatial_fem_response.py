@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -18,7 +19,7 @@ from scipy import sparse
 from echospline.errors import InputError
 from echospline.mechanics.finite_elements import METHOD, MPA, Method, lame
 from echospline.mechanics.half_space import Top, gradient, kelvinlet, tractions
-from echospline.mechanics.hexahedra import Cells, Hexahedra, lines_for
+from echospline.mechanics.hexahedra import FINE_GAUSS, Cells, Hexahedra, lines_for
 from echospline.mechanics.landmarks import SIDES, Clamps
 from echospline.mechanics.response import SpatialColumn
 from echospline.mechanics.space_response import ForceField, Forces, shear_modulus
@@ -29,9 +30,6 @@ NEAR = 1.0
 """Of a cell's diagonal: a cell closer to a force than this is integrated point by point, one further away by its nodes."""
 FACE_GAUSS = 4
 """Points per direction on a free or sliding face."""
-CELL_GAUSS = 5
-"""Points per direction in a cell near a force."""
-
 Material = tuple[float, float]
 """E in kPa and nu."""
 
@@ -103,7 +101,9 @@ class SpatialFEMResponse:
                 f"Poisson's ratio in space must lie in (-1, 0.5); got {max(ratios)}: take 0.49 for nearly incompressible tissue"
             )
         if len(clamps.points):
-            raise InputError("points cannot be clamped in space by finite elements; clamp a face, or use elastic")
+            raise InputError(
+                "points cannot be clamped in space by finite elements; clamp a face, or use elastic"
+            )
         if not (np.isfinite(radius) and radius > 0):
             raise InputError(f"radius of a force must be a positive number in mm; got {radius}")
         kind = clamps.kind("top")
@@ -111,16 +111,23 @@ class SpatialFEMResponse:
         low, _ = grid.corners
         if self.top is not None and abs(low[1]) > 1e-6:
             raise InputError(f"the surface of tissue in space is y = 0; the mesh begins at {low[1]:g} mm")
-        self.grid, self.clamps, self.tissue, self.radius = grid, clamps, tissue, radius
+        self.grid, self.clamps, self.tissue, self.radius, self.cell = grid, clamps, tissue, radius, cell
         self.mesh = Hexahedra(lines_for(grid, tissue, cell), tissue, clamps, method)
         self._less: dict[Material, sparse.csr_matrix] = {}
         self.mesh.solve(np.zeros((self.mesh.size, 3, 1)))  # factors now
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle what the response was made of; a copy factors anew."""
+        made = partial(SpatialFEMResponse, cell=self.cell, radius=self.radius, method=self.mesh.method)
+        return made, (self.grid, self.clamps, self.tissue)
 
     def column(self, places: Floats, weights: Floats) -> SpatialColumn:
         """Answer unit forces along x, y and z that are spread over places (m, 3) in mm by weights (m,); see `SpatialResponse`."""
         p = as_points(places, "places", 3) if len(places) else np.zeros((0, 3))
         if not self.grid.contains(p).all():
-            raise InputError(f"forces act inside the tissue; got places from {p.min(axis=0)} to {p.max(axis=0)} mm")
+            raise InputError(
+                f"forces act inside the tissue; got places from {p.min(axis=0)} to {p.max(axis=0)} mm"
+            )
         if self.top is not None:  # the image is that of a point: it stays a radius above the surface
             p = p.copy()
             p[:, 1] = np.maximum(p[:, 1], self.radius)
@@ -140,9 +147,7 @@ class SpatialFEMResponse:
             u += self._moves(points, column.places[some], column.weights[some], material)
         return u
 
-    def field_of(
-        self, columns: Sequence[SpatialColumn], forces: Floats
-    ) -> Callable[[Floats], Floats]:
+    def field_of(self, columns: Sequence[SpatialColumn], forces: Floats) -> Callable[[Floats], Floats]:
         """Field under forces (k, 3) in N, one for each column; see `SpatialResponse`."""
         values = np.zeros(3 * self.mesh.size)
         places, loads = [np.zeros((0, 3))], [np.zeros((0, 3))]
@@ -178,7 +183,9 @@ class SpatialFEMResponse:
         if not len(places):
             return {}
         material, which = np.unique(np.stack(self.tissue.at(places), axis=1), axis=0, return_inverse=True)
-        return {(float(E), float(nu)): np.flatnonzero(which.ravel() == k) for k, (E, nu) in enumerate(material)}
+        return {
+            (float(E), float(nu)): np.flatnonzero(which.ravel() == k) for k, (E, nu) in enumerate(material)
+        }
 
     def _scale(self, material: Material) -> float:
         return 1.0 / (16.0 * np.pi * shear_modulus(*material) * (1.0 - material[1]))
@@ -207,13 +214,13 @@ class SpatialFEMResponse:
             self._less[material] = self.mesh.difference(*material)
         less = self._less[material]
         u = moves.reshape(3 * n, 3)
-        loads = (less @ u).reshape(n, 3, 3)
+        loads: Floats = (less @ u).reshape(n, 3, 3)
         # cells near a force: what the nodes said is replaced by integration
         lam0, mu0 = (MPA * float(m) for m in lame(*material, "strain"))
         first, size = self.mesh.extents
         gap = np.maximum(np.maximum(first[:, None] - places, places - (first + size)[:, None]), 0.0)
         near = np.linalg.norm(gap, axis=2).min(axis=1) < NEAR * np.linalg.norm(size, axis=1)
-        where = self.mesh.integration_points(CELL_GAUSS, np.flatnonzero(near))
+        where = self.mesh.integration_points(FINE_GAUSS, np.flatnonzero(near))
         lam, mu = self.mesh.moduli(where)
         differs = ((lam != lam0) | (mu != mu0)).any(axis=1)
         where, lam, mu = where[differs], lam[differs] - lam0, mu[differs] - mu0
@@ -222,7 +229,7 @@ class SpatialFEMResponse:
         exact = self._slopes(where.reshape(-1, 3), places, weights, material)
         exact = exact.reshape(*where.shape[:2], 3, 3, 3)
         which = np.flatnonzero(near)[differs]
-        for i, (cell, dN, w) in enumerate(self.mesh.strains(which, CELL_GAUSS)):
+        for i, (cell, dN, w) in enumerate(self.mesh.strains(which, FINE_GAUSS)):
             nodes = self.mesh.cells[cell]
             nodal = np.einsum("qad,aik->qikd", dN, moves[nodes])
             slope = exact[i] - nodal
@@ -238,8 +245,10 @@ class SpatialFEMResponse:
         mu = shear_modulus(*material)
         for face, (points, normals, index, shares) in self._loose.items():
             G = gradient(points, places, material[1], self.radius, self.top)
-            t = mu * self._scale(material) * np.einsum(
-                "nimk,m->nik", tractions(G, normals, material[1]), weights
+            t = (
+                mu
+                * self._scale(material)
+                * np.einsum("nimk,m->nik", tractions(G, normals, material[1]), weights)
             )
             if self.clamps.kind(face) == "sliding":
                 t[:, SIDES[face][0]] = 0.0

@@ -76,9 +76,7 @@ class SpatialForceModel:
         self._kept: OrderedDict[tuple[bytes, bytes], SpatialColumn] = OrderedDict()
         self._lock = threading.Lock()
         none = np.zeros(3)
-        self._rest = SpatialForceState(
-            stick_slip.at_rest(3), (), np.zeros((0, 3)), NeedleLoad(), none, none
-        )
+        self._rest = SpatialForceState(stick_slip.at_rest(3), (), np.zeros((0, 3)), NeedleLoad(), none, none)
 
     @classmethod
     def green(

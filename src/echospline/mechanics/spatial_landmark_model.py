@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from functools import partial
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from echospline.errors import InputError
@@ -80,9 +79,7 @@ class SpatialLandmarkModel:
         if not self.tissue.homogeneous:
             self.stiffness = landmark_stiffness(self.tissue, grid, self.kernel, self.anchors)
         self.precision: Precision = precision
-        self.native = NativeStep(
-            grid, self.clamps, self.parameters, self.kernel, self.stiffness, precision
-        )
+        self.native = NativeStep(grid, self.clamps, self.parameters, self.kernel, self.stiffness, precision)
 
     def __reduce__(self) -> tuple[partial[SpatialLandmarkModel], tuple[object, ...]]:
         """Pickle what the model was made of; a copy has a workspace of its own."""

@@ -376,7 +376,9 @@ def _substep(
             return replace(state, tip=tip, axis=axis, across=across, depth=depth)
         if not _in_the_track(state, tip, axis, law.station_spacing):
             place = _entry(tip, axis, depth, extent)
-            state = _fresh(state, supply(Track.empty(len(axis)), station_at(place, axis, law.station_spacing, extent)))
+            state = _fresh(
+                state, supply(Track.empty(len(axis)), station_at(place, axis, law.station_spacing, extent))
+            )
     state = _grown(state, axis, RUN_AHEAD * travel, law.station_spacing, extent, supply)
     return _solve(state, tip, axis, depth, travel, dt, law)
 
@@ -444,7 +446,9 @@ class _Motion:
 
     axis: Floats
     across: Floats
-    within: list[list[Floats]]  # displacement along direction c at i by a force along d at j; the axis, then those across
+    within: list[
+        list[Floats]
+    ]  # displacement along direction c at i by a force along d at j; the axis, then those across
     eta: Floats
     eta_gained: Floats  # over eta before the substep, in tissue that had moved
     gap_gained: list[Floats]  # in every direction across
