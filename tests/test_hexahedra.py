@@ -58,9 +58,8 @@ def test_corrected_closed_forms_are_those_of_scikit_fem_on_the_same_mesh(held):
     v = theirs.correct(
         lambda p: base._moves(p, PLACES, FORCES), lambda p, n: base._pulls(p, n, PLACES, FORCES), points()
     )
-    assert (
-        off(summed(ours)(points()), v) < 1e-3
-    )  # the reference frees the surface of the rest that the image leaves
+    # a free surface is freed by a point's image: the reference takes away what that leaves of a spread force
+    assert off(summed(ours)(points()), v) < (2.5e-3 if held == "walls" else 1e-5)
 
 
 def spread_load(mesh, places, forces, radius):
@@ -73,32 +72,33 @@ def spread_load(mesh, places, forces, radius):
     return mesh.integrated(body)
 
 
-def graded(low, high, a, b, fine=1.0, coarse=4.5):
-    """A line whose cells are fine from a to b and grow outside."""
+def graded(low, high, a, b, fine=1.3, coarse=4.5, through=()):
+    """A line whose cells are fine from a to b and grow outside, with points on interfaces."""
     line = [low]
     while line[-1] < high - 1e-9:
         away = max(a - line[-1] - fine, line[-1] - b, 0.0)
         line.append(line[-1] + min(coarse, fine + 0.45 * away))
-    return low + (np.array(line) - low) * (high - low) / (line[-1] - low)
+    line = low + (np.array(line) - low) * (high - low) / (line[-1] - low)
+    return np.unique(np.append(line, through))
 
 
 @pytest.mark.parametrize(
-    ("regions", "allowed"),
+    ("regions", "interfaces", "allowed"),
     [
-        ([], 0.012),
-        ([Region(Sphere((5.5, 9.0, 0.0), 4.0), 50.0)], 0.045),
-        ([Region(Layer(11.0, 20.0), 50.0)], 0.045),
-        ([Region(Box((-12.0, 10.0, -9.0), (0.0, 20.0, 9.0)), 2.0)], 0.045),
+        ([], ((), (), ()), 0.012),
+        ([Region(Sphere((5.5, 9.0, 0.0), 4.0), 50.0)], ((), (), ()), 0.045),
+        ([Region(Layer(11.0, 20.0), 50.0)], ((), (11.0,), ()), 0.045),
+        ([Region(Box((-12.0, 10.0, -9.0), (0.0, 20.0, 9.0)), 2.0)], ((0.0,), (10.0,), ()), 0.045),
     ],
     ids=["homogeneous", "stiff sphere", "stiff layer", "soft box"],
 )
-def test_regions_answer_as_fine_elements_under_a_spread_load(regions, allowed):
-    radius, grid_clamps = 1.0, block(SIZE, HELD["walls"])
-    grid, clamps = grid_clamps
+def test_regions_answer_as_fine_elements_under_a_spread_load(regions, interfaces, allowed):
+    radius = 1.2
+    grid, clamps = block(SIZE, HELD["walls"])
     tissue = Tissue(10.0, 0.45, regions)
     low, high = grid.corners
     ends = PLACES.min(axis=0) - 1.0, PLACES.max(axis=0) + 1.0
-    lines = tuple(graded(low[k], high[k], ends[0][k], ends[1][k]) for k in range(3))
+    lines = tuple(graded(low[k], high[k], ends[0][k], ends[1][k], through=interfaces[k]) for k in range(3))
     fine = Hexahedra(lines, tissue, clamps)
     v = fine.at(fine.solve(spread_load(fine, PLACES, FORCES, radius)[:, :, None])[:, :, 0], points())
     u = summed(SpatialFEMResponse(grid, clamps, tissue, cell=3.5, radius=radius))(points())
@@ -195,12 +195,12 @@ def test_shapes_that_make_no_sense_get_a_sentence(make, said):
 
 def test_the_closed_form_is_what_elements_are_given_to_correct():
     """With faces far away the elements have next to nothing to do."""
-    grid = SpatialGrid.spanning((-200, 0, -200), (200, 400, 200), (3, 3, 3))
-    response = SpatialFEMResponse(grid, Clamps.of(grid, WALLS), Tissue(10.0, 0.45), cell=100.0)
+    grid = SpatialGrid.spanning((-2000, 0, -2000), (2000, 4000, 2000), (3, 3, 3))
+    response = SpatialFEMResponse(grid, Clamps.of(grid, WALLS), Tissue(10.0, 0.45), cell=1000.0)
     place = np.array([[0.0, 10.0, 0.0]])
     near = np.array([[3.0, 9.0, 2.0], [-2.0, 4.0, 1.0]])
     exact = kelvinlet(near, place, 0.45, 0.7, "free")[:, :, 0] / (
         16 * np.pi * shear_modulus(10.0, 0.45) * 0.55
     )
     u = response.column_at(response.column(place, np.ones(1)), near)
-    np.testing.assert_allclose(u, exact, atol=0.03 * np.abs(exact).max())
+    np.testing.assert_allclose(u, exact, atol=0.01 * np.abs(exact).max())
