@@ -1,6 +1,6 @@
 """Green's function against quadratic finite elements on unseen insertions: every combination of edges, and tissue with regions.
 
-    python benchmarks/green_accuracy.py              # the tables of docs/fem.md, about 20 minutes
+    python benchmarks/green_accuracy.py              # the tables of docs/fem.md, about 15 minutes
     python benchmarks/green_accuracy.py --regions    # the tables without the combinations of edges
     python benchmarks/green_accuracy.py --random 60  # random scenes: residual beside error
 

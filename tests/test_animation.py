@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +43,43 @@ def test_colour_tables_of_frames_are_passed_over(tmp_path: Path, mode: str) -> N
     path = tmp_path / "a.gif"
     pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=70, comment=b"x" * 700)
     assert gif_delays(path) == [70.0] * 6
+
+
+def test_stray_zeros_between_blocks_are_passed_over(tmp_path: Path) -> None:
+    pictures = [Image.fromarray(np.full((9, 11), 40 * k, np.uint8)) for k in range(5)]
+    path = tmp_path / "a.gif"
+    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=70)
+    block = b"\x21\xf9\x04"
+    assert path.read_bytes().count(block) == 5
+    path.write_bytes(path.read_bytes().replace(block, b"\0\0" + block))
+    assert gif_delays(path) == [70.0] * 5
+    np.testing.assert_allclose(read(path, spacing=(0.1, 0.1)).times, 0.07 * np.arange(5))
+
+
+@pytest.mark.parametrize("blocks", [True, False])
+def test_a_gif_without_delays_has_the_times_of_browsers(tmp_path: Path, blocks: bool) -> None:
+    path = animation(tmp_path / "a.gif", 4, 0)
+    if not blocks:
+        path.write_bytes(
+            re.sub(rb"\x21\xf9\x04.{4}\0(?=[\x2c\x21])", b"", path.read_bytes(), flags=re.DOTALL)
+        )
+        assert gif_delays(path) == [None] * 4
+    cine = read(path, spacing=(0.1, 0.1))
+    np.testing.assert_allclose(cine.times, 0.1 * np.arange(4))
+    assert any("no duration" in note for note in cine.notes)
+
+
+def test_a_picture_before_the_animation_is_a_frame_without_a_duration(tmp_path: Path) -> None:
+    pictures = [Image.fromarray(np.full((9, 11), 40 * k, np.uint8)) for k in range(4)]
+    path = tmp_path / "a.png"
+    pictures[0].save(
+        path, save_all=True, default_image=True, append_images=pictures[1:], duration=[30, 50, 70]
+    )
+    assert png_delays(path) == [30.0, 50.0, 70.0]
+    cine = read(path, spacing=(0.1, 0.1))
+    assert [frame[0, 0] for frame in cine.frames] == [0, 40, 80, 120]
+    np.testing.assert_allclose(cine.times, [0.0, 0.1, 0.13, 0.18])
+    assert any("no duration" in note for note in cine.notes)
 
 
 def test_a_still_picture_has_one_frame_and_no_times(tmp_path: Path) -> None:

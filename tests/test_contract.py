@@ -34,7 +34,7 @@ LANDMARKS = TPSParameters(sigma=0.8, contact_spacing=0.0, anchor_spacing=2.0)
 
 def landmark_model(kernel):
     def make(grid, clamped, scale=1.0):
-        lengths = ("sigma", "delta", "length", "anchor_spacing")
+        lengths = ("sigma", "delta", "length", "anchor_spacing", "friction_speed")
         parameters = replace(LANDMARKS, **{name: scale * getattr(LANDMARKS, name) for name in lengths})
         scaled = Elastic(kernel.nu, kernel.radius * scale) if isinstance(kernel, Elastic) else kernel
         return TPSModel(grid, clamped, parameters, scaled)

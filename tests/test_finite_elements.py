@@ -18,7 +18,7 @@ from echospline.mechanics.finite_elements import (
     shape_functions,
     stiffness,
 )
-from echospline.scenario import Scenario, prepared
+from echospline.scenario import Scenario, check
 from echospline.scene import RegularGrid
 
 E, NU, THICKNESS = 10.0, 0.45, 5.0  # kPa, 1, mm
@@ -330,6 +330,6 @@ def test_without_the_extra_superlu_is_the_default_and_cholmod_explains_itself(mo
 
 def test_a_command_says_that_superlu_factors(monkeypatch):
     monkeypatch.setattr("echospline.scenario.scale.find_spec", lambda name: None)
-    _, doubts = prepared(Scenario().with_values({"model.kind": "fem"}), sample_image())
+    doubts = check(Scenario().with_values({"model.kind": "fem"}), sample_image())
     assert any("SuperLU" in doubt and "echospline[cholmod]" in doubt for doubt in doubts)
-    assert prepared(Scenario(), sample_image())[1] == []
+    assert check(Scenario(), sample_image()) == []

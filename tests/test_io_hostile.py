@@ -23,6 +23,7 @@ from pydicom.data import get_testdata_file
 from echospline.errors import EchosplineError, InputError
 from echospline.io import DisplacementWriter, displacement_shapes, open_writer, read, read_displacement
 from echospline.scene import NeedlePose, RegularGrid
+from written_inputs import dicom, nifti, oriented, sequence, video
 
 STACK = np.random.default_rng(7).integers(0, 256, (3, 12, 17), dtype=np.uint8)
 
@@ -53,6 +54,19 @@ def samples() -> dict[str, bytes]:
             for k in range(3):
                 record.add(np.full((6, 2), k), float(k), NeedlePose((0, 0), (0, 1), 1))
         made["npz"] = (folder / "a.npz").read_bytes()
+        written = {
+            "sequence mha": sequence(folder / "s.mha", stack=STACK, fields=("ElementSpacing = 0.1 0.1 1",)),
+            "time nii": nifti(folder / "t.nii", stack=STACK, slope=0.5, units=10, time=0.1, order=">"),
+            "turned mp4": video(folder / "t.mp4", matrix=(0, 1, -1, 0), frames=STACK[:, :12, :16]),
+            "turned jpg": oriented(folder / "t.jpg", 6, STACK[0]),
+            "turned tif": oriented(folder / "t.tif", 8, STACK[0]),
+            "bare dcm": dicom(folder / "b.dcm", frames=1, bare=True),
+            "timed dcm": dicom(
+                folder / "t.dcm", frames=3, FrameTime=40, FrameTimeVector=[0, 40, 50], RescaleSlope="2",
+                FrameIncrementPointer=0x00181065,
+            ),
+        }  # fmt: skip
+        made |= {kind: path.read_bytes() for kind, path in written.items()}
     finally:
         for file in folder.iterdir():
             file.unlink()
@@ -121,8 +135,8 @@ def test_a_wrong_suffix_changes_nothing_or_is_named(tmp_path: Path, kind: str) -
     wrong = "dcm" if suffix_of(kind) in ("png", "npz") else "png"
     path = tmp_path / f"a.{wrong}"
     path.write_bytes(SAMPLES[kind])
-    if kind in ("npz", "nii", "nii.gz"):
-        with pytest.raises(InputError, match=r"read_displacement|rename it"):
+    if kind == "npz":
+        with pytest.raises(InputError, match="read_displacement"):
             take(path)
     else:
         take(path)
@@ -136,7 +150,6 @@ def test_a_wrong_suffix_changes_nothing_or_is_named(tmp_path: Path, kind: str) -
         (b"%PDF-1.7 ...", "is a PDF document"),
         (b"hello, this is no picture", "begins with b'hello, t'"),
         (b"MATLAB 5.0 MAT-file", "Matlab"),
-        (b"\x08\x00\x05\x00CS\n\x00ISO_IR 100", "DICOM without its preamble"),
         (b"\x1f\x8b\x08\x00junk", "which no known format does"),
     ],
 )

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import gzip
 import re
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +15,7 @@ import SimpleITK
 from echospline.errors import InputError
 from echospline.io import open_cine, open_writer, read
 from echospline.scene import Cine, RegularGrid, UltrasoundImage
+from written_inputs import nifti
 
 STACK = np.random.default_rng(5).integers(0, 256, (4, 21, 33), dtype=np.uint8)
 SUFFIXES = ["mha", "mhd", "nrrd", "nhdr", "nii", "nii.gz"]
@@ -60,8 +64,10 @@ def test_pixel_types_are_kept(tmp_path: Path, suffix: str, dtype: type) -> None:
 def test_colour_becomes_luma_or_stays(tmp_path: Path) -> None:
     rgb = np.random.default_rng(2).integers(0, 256, (21, 33, 3), dtype=np.uint8)
     SimpleITK.WriteImage(SimpleITK.GetImageFromArray(rgb, isVector=True), str(tmp_path / "a.mha"))
-    np.testing.assert_array_equal(read(tmp_path / "a.mha", colour=True).pixels, rgb)
-    np.testing.assert_allclose(read(tmp_path / "a.mha").pixels, rgb @ [0.299, 0.587, 0.114], atol=0.5001)
+    np.testing.assert_array_equal(read(tmp_path / "a.mha", spacing=(0.1, 0.1), colour=True).pixels, rgb)
+    np.testing.assert_allclose(
+        read(tmp_path / "a.mha", spacing=(0.1, 0.1)).pixels, rgb @ [0.299, 0.587, 0.114], atol=0.5001
+    )
 
 
 def test_mouse_liver_equals_itk_and_its_header(recordings: Path) -> None:
@@ -76,18 +82,18 @@ def test_mouse_liver_equals_itk_and_its_header(recordings: Path) -> None:
         read(path)
 
 
-def test_plus_scan_converted_picture_says_that_its_spacing_is_doubtful(recordings: Path) -> None:
-    image = read(recordings / "pluslib" / "BkCurvilinearScanConvertedData.igs.mha")
+def test_one_by_one_millimetre_is_no_spacing_but_asked_for(recordings: Path) -> None:
+    path = recordings / "pluslib" / "BkCurvilinearScanConvertedData.igs.mha"
+    with pytest.raises(InputError, match=r"1 x 1 mm, which writers put where nothing is known.*--spacing"):
+        read(path)
+    image = read(path, spacing=(0.2, 0.2))
     assert image.grid.shape == (600, 400)
-    assert image.grid.spacing == (1.0, 1.0)
-    assert "1 x 1 mm" in image.source
-    assert read(
-        recordings / "pluslib" / "BkCurvilinearScanConvertedData.igs.mha", spacing=(0.2, 0.2)
-    ).spacing == (0.2, 0.2)
+    assert image.spacing == (0.2, 0.2)
+    assert any("1 x 1 mm" in note for note in image.notes)
 
 
 def test_plus_lines_are_turned_so_that_depth_runs_down(recordings: Path) -> None:
-    image = read(recordings / "pluslib" / "BkCurvilinearRfData.igs.mhd")
+    image = read(recordings / "pluslib" / "BkCurvilinearRfData.igs.mhd", spacing=(0.2, 0.02))
     raw = np.fromfile(recordings / "pluslib" / "BkCurvilinearRfData.raw", dtype="<i2").reshape(358, 3480)
     np.testing.assert_array_equal(image.pixels, raw.T)
     assert "not B-mode" in image.source
@@ -143,11 +149,12 @@ def test_slicer_sequence_with_the_list_first_is_a_cine_with_its_times(tmp_path: 
 @pytest.mark.parametrize(("unit", "factor"), [("mm", 1.0), ("cm", 10.0), ("um", 1e-3), ("m", 1000.0)])
 def test_nrrd_lengths_become_millimetres(tmp_path: Path, unit: str, factor: float) -> None:
     header = (
-        "NRRD0004\ntype: uint8\ndimension: 2\nspace dimension: 2\nsizes: 33 21\nspace directions: (0.1,0) (0,0.2)\n"
+        "NRRD0004\ntype: uint8\ndimension: 2\nspace dimension: 2\nsizes: 33 21\n"
+        f"space directions: ({0.1 / factor:.9g},0) (0,{0.2 / factor:.9g})\n"
         f'space units: "{unit}" "{unit}"\nencoding: raw\n\n'
     )
     (tmp_path / "a.nrrd").write_bytes(header.encode() + STACK[0].tobytes())
-    assert read(tmp_path / "a.nrrd").spacing == pytest.approx((0.1 * factor, 0.2 * factor))
+    assert read(tmp_path / "a.nrrd").spacing == pytest.approx((0.1, 0.2))
 
 
 def test_a_header_without_spacing_names_the_option(tmp_path: Path) -> None:
@@ -213,3 +220,82 @@ def test_four_axes_and_five_values_per_pixel_are_refused(tmp_path: Path) -> None
     )
     with pytest.raises(InputError, match="values per pixel"):
         read(tmp_path / "b.mha")
+
+
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("suffix", ["mha", "nrrd"])
+def test_big_endian_pixels_are_turned_round(tmp_path: Path, suffix: str, packed: bool) -> None:
+    values = (STACK.astype(np.int16) - 100) * 200
+    content = values.astype(">i2").tobytes()
+    if suffix == "mha":
+        head = (
+            "ObjectType = Image\nNDims = 3\nBinaryData = True\nBinaryDataByteOrderMSB = True\n"
+            f"CompressedData = {packed}\nDimSize = 33 21 4\nElementSpacing = 0.1 0.2 1\nElementType = MET_SHORT\n"
+            "ElementDataFile = LOCAL\n"
+        )
+        content = zlib.compress(content) if packed else content
+    else:
+        head = (
+            "NRRD0004\ntype: short\ndimension: 3\nsizes: 33 21 4\nspacings: 0.1 0.2 1\nkinds: domain domain list\n"
+            f"endian: big\nencoding: {'gzip' if packed else 'raw'}\n\n"
+        )
+        content = gzip.compress(content) if packed else content
+    (tmp_path / f"a.{suffix}").write_bytes(head.encode() + content)
+    np.testing.assert_array_equal(read(tmp_path / f"a.{suffix}", fps=10).frames, values)
+    for k in range(4):
+        np.testing.assert_array_equal(read(tmp_path / f"a.{suffix}", frame=k).pixels, values[k])
+
+
+def test_a_gzip_file_of_several_members_is_read_to_its_end(tmp_path: Path) -> None:
+    whole = nifti(tmp_path / "a.nii", stack=STACK).read_bytes()
+    parts = [whole[i : i + 500] for i in range(0, len(whole), 500)]
+    (tmp_path / "b.nii.gz").write_bytes(b"".join(gzip.compress(part) for part in parts))
+    np.testing.assert_array_equal(read(tmp_path / "b.nii.gz", fps=10).frames, STACK)
+    (tmp_path / "c.nii.gz").write_bytes(b"".join(gzip.compress(part) for part in parts[:-1]))
+    with pytest.raises(InputError, match="cut short"):
+        read(tmp_path / "c.nii.gz", fps=10)
+
+
+def test_encodings_that_only_itk_reads_are_left_to_it(tmp_path: Path) -> None:
+    head = (
+        "NRRD0004\ntype: uint8\ndimension: 3\nsizes: 33 21 4\nspacings: 0.1 0.2 1\nkinds: domain domain list\n"
+        "encoding: ascii\n\n"
+    )
+    (tmp_path / "a.nrrd").write_text(head + " ".join(map(str, STACK.ravel())) + "\n")
+    np.testing.assert_array_equal(read(tmp_path / "a.nrrd", fps=10).frames, STACK)
+    np.testing.assert_array_equal(read(tmp_path / "a.nrrd", frame=2).pixels, STACK[2])
+
+
+def test_nifti_2_is_read(tmp_path: Path) -> None:
+    h = bytearray(544)
+    struct.pack_into("<i8s2h8q", h, 0, 540, b"n+2\0\r\n\x1a\n", 4, 16, 3, 33, 21, 4, 1, 1, 1, 1)
+    struct.pack_into("<8dq2d", h, 104, 1, 0.1, 0.2, 1, 1, 1, 1, 1, 544, 2.0, 1.0)
+    struct.pack_into("<i", h, 500, 2)
+    (tmp_path / "a.nii").write_bytes(bytes(h) + STACK.astype("<i2").tobytes())
+    cine = read(tmp_path / "a.nii", fps=10)
+    np.testing.assert_array_equal(cine.frames, 2.0 * STACK + 1)
+    assert cine.grid.spacing == (0.1, 0.2)
+
+
+@pytest.mark.parametrize(
+    "kinds", ["RGB-color domain domain", "domain domain RGB-color", "4-color domain domain"]
+)
+def test_colour_of_nrrd_is_where_its_kinds_say(tmp_path: Path, kinds: str) -> None:
+    n = 4 if kinds.startswith("4") else 3
+    rgb = np.random.default_rng(2).integers(0, 256, (21, 33, n), dtype=np.uint8)
+    last = kinds.endswith("color")
+    sizes = f"33 21 {n}" if last else f"{n} 33 21"
+    head = f"NRRD0004\ntype: uint8\ndimension: 3\nsizes: {sizes}\nkinds: {kinds}\nencoding: raw\n\n"
+    content = (np.moveaxis(rgb, -1, 0) if last else rgb).tobytes()
+    (tmp_path / "a.nrrd").write_bytes(head.encode() + content)
+    np.testing.assert_array_equal(
+        read(tmp_path / "a.nrrd", colour=True, spacing=(0.1, 0.1)).pixels, rgb[..., :3]
+    )
+
+
+def test_nifti_equals_what_itk_reads(tmp_path: Path) -> None:
+    path = nifti(tmp_path / "a.nii", stack=STACK.astype(np.int16), slope=2.0, intercept=1.0)
+    itk = SimpleITK.ReadImage(str(path))
+    cine = read(path, fps=10)
+    np.testing.assert_array_equal(cine.frames, SimpleITK.GetArrayFromImage(itk))
+    assert cine.grid.spacing == pytest.approx(itk.GetSpacing()[:2])

@@ -156,7 +156,8 @@ def test_the_c_library_reads_every_message_with_a_sound_check_sum(peer: Path) ->
 
 def test_what_the_c_library_sends_is_received_as_server_and_as_client(peer: Path) -> None:
     async def scene() -> None:
-        files = sorted((HERE / "golden").glob("[!G]*.bin"))
+        questions = ("Get", "Start", "Stop")  # the link itself answers these
+        files = sorted(p for p in (HERE / "golden").glob("*.bin") if not p.stem.startswith(questions))
         expected = [f.stem for f in files]
         inbox = Inbox()
         server = Link(inbox)

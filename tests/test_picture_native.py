@@ -176,7 +176,7 @@ def test_a_drawing_shows_the_needle_and_forgets_it():
     np.testing.assert_array_equal(drawing.draw(bump(1.0), outside, NeedleEcho()).image.pixels, bare)
 
 
-@pytest.mark.parametrize("border", [1e9, -1e9, float("inf")])
+@pytest.mark.parametrize("border", [1e9, -1e9])
 def test_borders_beyond_the_core_are_drawn_outside_it(border):
     image = UltrasoundImage(IMAGE.pixels.astype(np.float32), IMAGE.grid)
     moved = warp(image, Deformation(MESH, bump(0.0) + np.array([2.0, 0.0])), border=border).pixels

@@ -27,11 +27,10 @@ from echospline.errors import InputError
 from echospline.io import open_writer, read, read_image
 from echospline.scenario import (
     Scenario,
-    check_points,
+    check,
     check_store,
     load,
     needle_doubts,
-    prepared,
     size_doubts,
 )
 from echospline.scenario.scale import _inside
@@ -159,13 +158,13 @@ def test_doubts_are_said_and_kept_in_the_report(picture, tmp_path):
 
 def test_a_long_run_says_what_it_will_cost():
     long = Scenario().with_values({"needle.speed": 0.005, "output.formats": ["mp4"]})
-    _, doubts = prepared(long, image_of("uint8", 255))
+    doubts = check(long, image_of("uint8", 255))
     (said,) = [doubt for doubt in doubts if "long run" in doubt]
     for word in ("frames", "GiB on the disk", "min on a machine", "0.005 m/s meant"):
         assert word in said
-    assert prepared(Scenario(), image_of("uint8", 255))[1] == []
+    assert check(Scenario(), image_of("uint8", 255)) == []
     scattered = Scenario().with_values({"output.image_model": "rescatter", "needle.speed": 1.0})
-    assert any("long run" in doubt for doubt in prepared(scattered, image_of("uint8", 255))[1])
+    assert any("long run" in doubt for doubt in check(scattered, image_of("uint8", 255)))
 
 
 @pytest.mark.parametrize(
@@ -175,14 +174,48 @@ def test_a_long_run_says_what_it_will_cost():
 def test_pictures_of_any_type_simulate_with_the_defaults(tmp_path, dtype, top):
     """What is dark and bright in the file is dark and bright in the cine, and the window is written down."""
     image = image_of(dtype, top)
-    scenario, doubts = prepared(Scenario(), image)
-    assert scenario.output.window == (0.0, float(image.pixels.max()))
-    assert any(dtype in doubt and "--window" in doubt for doubt in doubts)
-    with open_writer(tmp_path / "a.gif", image.grid, 10, window=scenario.output.window) as writer:
+    with open_writer(tmp_path / "a.mha", image.grid, 10) as writer:
         writer.add(image.pixels, 0.0)
+        writer.add(image.pixels, 0.1)
+    given = Scenario().with_values({"image.file": "a.mha"})
+    scenario, taken = given.opened(tmp_path, eight_bit=None)
+    low, high = float(image.pixels.min()), float(image.pixels.max())
+    assert scenario.image.window == (low, high)
+    assert any(f"values {low:g} to {high:g} are shown as black to white" in note for note in taken.notes)
+    with open_writer(tmp_path / "a.gif", image.grid, 10) as writer:
+        writer.add(taken.pixels, 0.0)
     shown = read_image(str(tmp_path / "a.gif"), spacing=(0.1, 0.1)).pixels
-    expected = np.rint(255 * (image.pixels.astype(float) / image.pixels.max()))
+    expected = np.rint(255 * (image.pixels.astype(float) - low) / (high - low))
     np.testing.assert_allclose(shown, expected, atol=0.5)
+    kept, raw = given.with_values({"output.formats": ["mha"]}).opened(tmp_path, eight_bit=None)
+    assert kept.image.window is None
+    np.testing.assert_array_equal(raw.pixels, image.pixels)
+
+
+def test_a_picture_of_values_that_are_not_finite_is_refused_in_one_sentence(tmp_path):
+    for fill, word in (
+        (np.where(np.arange(320) % 7 == 0, np.nan, 1.0), "not finite"),
+        (np.full(320, np.nan), "finite"),
+    ):
+        pixels = np.broadcast_to(fill, (240, 320)).astype("float32")
+        with open_writer(tmp_path / "a.mha", RegularGrid((320, 240), (0.1, 0.1)), 10) as writer:
+            writer.add(pixels, 0.0)
+            writer.add(pixels, 0.1)
+        with pytest.raises(InputError, match=word):
+            Scenario().with_values({"image.file": "a.mha"}).opened(tmp_path, eight_bit=None)
+
+
+def test_a_window_holds_for_the_phantom_too():
+    values = {
+        "image.file": "sample:phantom",
+        "phantom.size": [10, 10],
+        "phantom.pixel": [0.2, 0.2],
+        "phantom.per_cell": 1,
+    }
+    plain = Scenario().with_values(values)
+    raw = plain.opened(Path())[1].pixels
+    shown = plain.with_values({"image.window": [50, 150]}).opened(Path())[1].pixels
+    np.testing.assert_array_equal(shown, np.clip(np.rint((raw - 50.0) * 2.55), 0, 255))
 
 
 @pytest.mark.parametrize("kind", ["grey16", "rgb", "float"])
@@ -200,7 +233,7 @@ def test_the_command_takes_grey16_rgb_and_float(tmp_path, kind):
     done = echospline("simulate", file, *spacing, *QUICK, "--out", tmp_path / "out", "--json")
     assert done.returncode == 0, done.stderr
     scenario = load(tmp_path / "out" / "scenario.toml")
-    assert (scenario.output.window is None) == (kind == "rgb")
+    assert (scenario.image.window is None) == (kind == "rgb")
     cine = read(tmp_path / "out" / "cine.mp4")
     assert cine.frames.max() > 240
     assert not list((tmp_path / "out").glob("*.part"))
@@ -209,10 +242,7 @@ def test_the_command_takes_grey16_rgb_and_float(tmp_path, kind):
     np.testing.assert_array_equal(read(tmp_path / "again" / "cine.mp4").frames, cine.frames)
 
 
-def test_too_many_points_and_samples_are_refused_before_they_are_laid_out(tmp_path):
-    with pytest.raises(InputError, match=r"--grid = 0.0005 mm .* points"):
-        check_points(GRID, 0.0005, 10, "--grid")
-    check_points(GRID, 0.5, 100, "--grid")
+def test_too_many_samples_are_refused_before_they_are_laid_out(tmp_path):
     with pytest.raises(InputError, match=r"samples of .* are free"):
         check_store(10_000_000, 2**30, tmp_path)
     assert check_store(10, 1000, tmp_path) == []
@@ -226,9 +256,13 @@ def test_tracking_refuses_a_picture_of_no_size_and_doubts_an_unlikely_one(tmp_pa
     far = echospline("track", tmp_path / "a.mp4", "--spacing", "86.6,86.6", "--out", tmp_path / "t.npz")
     assert far.returncode == 2
     assert "micrometres" in far.stderr
-    many = echospline("track", tmp_path / "a.mp4", "--grid", "0.0001", "--out", tmp_path / "t.npz")
-    assert many.returncode == 2
-    assert "points" in many.stderr
+    for grid, limit, word in (("0.0001", 10_000_000, "points"), ("0.01", 100, "--limit")):
+        many = echospline(
+            "track", tmp_path / "a.mp4", "--grid", grid, "--limit", limit, "--out", tmp_path / "t.npz"
+        )
+        assert many.returncode == 2
+        assert word in many.stderr
+        assert len(many.stderr.splitlines()) == 1
     assert not (tmp_path / "t.npz").exists()
 
 
@@ -238,7 +272,8 @@ def test_info_says_of_the_size_what_simulate_says(tmp_path, spacing, said):
         for k in range(2):
             writer.add(np.zeros((240, 320), np.uint8), k / 10)
     notes = json.loads(echospline("info", tmp_path / "a.mha", "--json").stdout)["notes"]
-    found = [note for note in notes if "expected 5 to 500 mm a side" in note]
+    words = ("expected 5 to 500 mm a side", "no distance of pixels")
+    found = [note for note in notes if any(word in note for word in words)]
     assert bool(found) == said
     done = echospline("simulate", tmp_path / "a.mha", *QUICK, "--out", tmp_path / "out")
     assert not found or found[0] in done.stderr

@@ -382,8 +382,10 @@ def test_simulate_writes_recordings_that_carry_the_needle(tmp_path: Path) -> Non
 
 
 def test_a_recorded_procedure_is_simulated_again_and_compared(tmp_path: Path) -> None:
-    words = ["--mesh", "16x12", "--needle-frame", "NeedleTip"]
+    words = ["--mesh", "16x12", "--model", "tps", "--needle-frame", "NeedleTip"]
     tissue = [
+        "--model",
+        "tps",
         "--mesh",
         "16x12",
         "--entry",

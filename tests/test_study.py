@@ -156,7 +156,7 @@ def test_a_stiff_region_holds_a_single_landmark_back_as_its_modulus_says():
         inside = np.flatnonzero(np.isfinite(stiffness))
         assert set(inside) == set(np.flatnonzero(Circle((20.0, 14.0), 5.0).contains(grid.nodes)))
         node = grid.nearest((20.0, 14.0))
-        landmarks = np.vstack([anchors, grid.nodes[node]])
+        landmarks = np.vstack([anchors.places, grid.nodes[node]])
         firm = np.append(np.full(len(anchors), np.inf), stiffness[node])
         asked = np.zeros((len(landmarks), 2))
         asked[-1] = (0.3, 0.4)
@@ -219,9 +219,16 @@ def test_too_small_a_grid_is_refused(tmp_path):
         brute_force(runs=3, frames=2, nodes=(9, 7))
 
 
-def test_a_scenario_with_a_stiff_region_holds_landmarks_back_there(tmp_path):
+@pytest.mark.parametrize("loading", ["stick", "follow"])
+def test_a_scenario_with_a_stiff_region_holds_landmarks_back_there(loading):
     """The same needle into the middle of a lesion ten times as stiff displaces it less, by spline as by FEM."""
-    scene = validated({"mesh": {"nodes": [21, 16]}}, "test")
+    # landmarks that stick are displaced as far as friction holds them, in the lesion as around it: there a spline holds back less
+    most = (
+        {"tps": 0.92, "elastic": 0.8, "fem": 0.6, "green": 0.6}
+        if loading == "stick"
+        else dict.fromkeys(("tps", "elastic", "fem", "green"), 0.8)
+    )
+    scene = validated({"mesh": {"nodes": [21, 16]}, "model": {"landmarks": {"loading": loading}}}, "test")
     region = {"young": 100.0, "circle": {"centre": [20.0, 12.0], "radius": 5.0}}
     with_lesion = scene.with_values({"tissue.region": [region]})
     grid = RegularGrid((21, 16), (2.0, 2.0))
@@ -235,4 +242,4 @@ def test_a_scenario_with_a_stiff_region_holds_landmarks_back_there(tmp_path):
             for t in np.linspace(0.1, insertion.duration, 12):
                 state = model.advance(state, insertion.pose(t), 0.2)
             largest.append(np.hypot(*model.displacement(state)[inside].T).max())
-        assert largest[1] < 0.8 * largest[0], kind
+        assert largest[1] < most[kind] * largest[0], kind

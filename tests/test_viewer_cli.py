@@ -78,7 +78,10 @@ def test_live_serves_the_page_and_the_real_model_and_ends_when_told(tmp_path):
             said = next(line for line in process.stderr if "http://" in line)  # after a first compilation
             address = re.search(r"http://\S+", said).group().rstrip("/")
             with page(address) as client:
-                assert [m["name"] for m in client.hello["scene"]["models"]] == list(MODELS)
+                assert [m["name"] for m in client.hello["scene"]["models"]] == [
+                    "green",
+                    *(m for m in MODELS if m != "green"),
+                ]
                 entry = tuple(client.hello["pose"]["entry"])
                 frame = client.until(lambda f: f.largest > 0.2, (*entry, 50.0, 8.0), timeout=90)
                 assert frame.flags & SPLINE  # landmarks and weights, not nodes

@@ -16,9 +16,9 @@ constexpr double LET_GO =
     2e-5;  // mm; a landmark that has left the needle is dropped once this close to the field without it
 constexpr double CALM =
     2.5;  // no node moves further in a step than this times the needle's travel and the relaxation due
-constexpr double SUBSTEP =
-    0.25;  // mm of travel after which a step looks again at who touches the needle: longer ones would depend on the time step
-constexpr int MOST_SUBSTEPS = 100;  // in one step; a needle that moves further at once has been put elsewhere, not moved
+constexpr double SUBSTEP = 0.25;  // mm of travel in a substep where friction has no reach
+constexpr int MOST_SUBSTEPS =
+    100;                          // in one step; a needle that moves further at once has been put elsewhere, not moved
 constexpr double ARRIVED = 1e-4;  // mm; a needle this near to where it is commanded is put exactly there
 
 /// Parameters of the interaction, in the paper's names.
@@ -103,6 +103,8 @@ inline double yielding(double f, double clearance) {
   const double near = clearance / reach, step = near * near * (3 - 2 * near);
   return f * step * step;
 }
+/// Travel after which a step looks again at who touches the needle, mm: a sixth of friction's reach. Longer ones would depend on the time step.
+inline double longest_substep(const Interaction& p) { return p.delta > 0 ? p.delta / 6 : SUBSTEP; }
 /// How far the tip pushes, mm, where friction is not at once: beside what is clamped it fades as friction does.
 inline double tip_push_yielding(const Interaction& p, double depth, double clearance) {
   return yielding(smaller(p.sigma, depth), clearance);

@@ -75,7 +75,7 @@ class Tissue {
     const bool immediate = scene.interaction.immediate;
     const Pose<D> now{point_of<D>(given.entry), point_of<D>(given.tip)};
     const Pose<D> before = state.posed ? state.before : Pose<D>{now.entry, now.entry};
-    const double pieces = std::ceil(travel_of(before, now) / SUBSTEP - 1e-9);
+    const double pieces = std::ceil(travel_of(before, now) / longest_substep(scene.interaction) - 1e-9);
     const int parts = immediate ? 1 : static_cast<int>(smaller(larger(pieces, 1.0), 1.0 * MOST_SUBSTEPS));
     const int64_t held_back = state.held_back;
     if (parts > 1) keep_state();

@@ -47,10 +47,11 @@ def dataset(
 
     with as_file(files("echospline").joinpath("data", "dataset.toml")) as own:
         bases = [str(path.resolve()) for path in scenarios or [own]]
-        shapes = {(s.phantom.grid().shape, s.mesh.nodes) for s in map(scenario_room.load, map(Path, bases))}
-        for base in bases:
-            first = scenario_room.load(Path(base))
+        loaded = [(Path(base), scenario_room.load(base)) for base in bases]
+        for base, first in loaded:
+            say((f"{base.name}: {note}" for note in first.label_notes(base.parent)), "note")
             say(scenario_room.needle_doubts(first.insertion(), first.phantom.grid()))
+        shapes = {(first.phantom.grid().shape, first.mesh.nodes) for _, first in loaded}
         (nx, ny), (mx, my) = next(iter(shapes))
         if len(shapes) > 1:
             raise InputError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,24 +16,31 @@ from echospline import scenario as scenario_room
 from echospline.errors import InputError
 from echospline.io import (
     LIMIT,
-    MIB,
+    PICTURES,
     SAMPLE,
     SAMPLES,
     Recording,
+    decoding,
     displacement_shapes,
     kind_of,
+    list_arrays,
+    open_echoes,
     open_recording,
     read_displacement,
     sample_image,
 )
 from echospline.scene import RegularGrid
 
+LARGEST_REPORT = 2**26
+"""Bytes of a report that is still read."""
+
 
 def info(
     file: Annotated[
         str,
         typer.Argument(
-            help="Image, cine, DICOM, displacement.npz or scenario; sample:calf is the image that ships with echospline.",
+            help="Image, cine, DICOM, RF data, scenario, or a result of echospline: its folder, run.json, displacement.npz, "
+            "echoes.npz, a track; sample:calf is the image that ships with echospline.",
             show_default=False,
         ),
     ],
@@ -85,16 +93,136 @@ def describe(file: str, limit: float = LIMIT) -> dict[str, Any]:
     """
     if file.startswith(SAMPLE):
         return _of_sample(file.removeprefix(SAMPLE))
+    if not file.strip():
+        raise InputError("expected a file or folder; got an empty name")
     path = Path(file)
     if path.is_dir():
-        return {"file": str(path)} | _of_recording(open_recording(path, limit))
+        return {"file": str(path)} | (_of_results(path) or _of_recording(_header(path, limit), limit))
+    if (report := _report(path)) is not None:
+        return {"file": str(path), "bytes": path.stat().st_size} | _of_report(report, path.parent)
     kind, name = kind_of(path)
     about: dict[str, Any] = {"file": str(path), "format": name, "bytes": path.stat().st_size}
     if kind == "displacement":
-        return about | _of_displacement(path, limit)
-    if kind == "toml":
-        return about | _of_toml(path)
-    return about | _of_recording(open_recording(path, limit))
+        about |= _of_echoes(path) if "iq.npy" in _members(path) else _of_displacement(path, limit)
+    elif kind in ("toml", "arrays"):
+        about |= _of_toml(path) if kind == "toml" else _of_arrays(path)
+    else:
+        about |= _of_recording(_header(path, limit), limit)
+    return about
+
+
+def _header(path: Path, limit: float) -> Recording:
+    """Open a recording for its header alone: only one frame of it need fit the limit."""
+    return open_recording(path, limit, whole=False)
+
+
+def _members(path: Path) -> list[str]:
+    with decoding(path, "npz"), zipfile.ZipFile(path) as archive:
+        return archive.namelist()
+
+
+def _report(path: Path) -> dict[str, Any] | None:
+    """Return the content of a report of a run (run.json, dataset.json ...); None for any other file."""
+    if path.suffix.lower() != ".json" or not path.is_file() or path.stat().st_size > LARGEST_REPORT:
+        return None
+    try:
+        found = json.loads(path.read_text(encoding="utf-8-sig"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} is no valid JSON: {' '.join(str(error).split())}") from error
+    return found if isinstance(found, dict) else None
+
+
+def _of_report(report: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Describe the report of a run, and say which of its files are there."""
+    if "model" not in report or "frames" not in report:
+        if "samples_per_second" in report:
+            kept = ("samples", "made", "resumed", "seconds", "largest_mm")
+            return (
+                {"format": "report of a dataset"}
+                | {k: report[k] for k in kept if k in report}
+                | {"notes": []}
+            )
+        return {"format": "JSON, no report of a run", "keys": sorted(report)[:40], "notes": []}
+    names = [name for name in report.get("files", []) if isinstance(name, str)]
+    missing = [name for name in names if not (folder / name).exists()]
+    picture = report.get("image", {}) if isinstance(report.get("image"), dict) else {}
+    about = {
+        "format": "report of a run",
+        "made": report.get("made"),
+        "image": picture.get("source"),
+        "spacing_mm": picture.get("spacing_mm"),
+        "model": report["model"],
+        "frames": report["frames"],
+        "largest_displacement_mm": report.get("largest_displacement_mm"),
+        "folded": len(report.get("folded_frames") or []),
+        "seconds": report.get("seconds"),
+        "files": names,
+        "notes": [
+            *map(str, picture.get("notes") or []),
+            *map(str, report.get("doubts") or []),
+            *(f"{name} is no longer there" for name in missing),
+        ],
+    }
+    return {key: value for key, value in about.items() if value is not None}
+
+
+def _of_results(folder: Path) -> dict[str, Any] | None:
+    """Describe a folder of results; None for any other folder."""
+    if (folder / "run.json").is_file():
+        report = _report(folder / "run.json") or {}
+        unfinished = [f"{part.name} is unfinished" for part in sorted(folder.glob("*.part"))]
+        found = _of_report(report, folder)
+        return found | {"format": "results of a run", "notes": [*found["notes"], *unfinished]}
+    if (folder / "zarr.json").is_file():
+        report = _report(folder / "dataset.json") or {}
+        about = _report(folder / "zarr.json") or {}
+        attributes = about.get("attributes") if isinstance(about.get("attributes"), dict) else {}
+        kept = ("layout", "seed", "frames", "bases", "pixel_mm", "units")
+        listed = {key: attributes[key] for key in kept if attributes and key in attributes}
+        return {"format": "dataset (Zarr)"} | listed | (_of_report(report, folder) if report else {"notes": []}) | {
+            "format": "dataset (Zarr)"
+        }  # fmt: skip
+    if not any(f.suffix.lower() in PICTURES for f in folder.iterdir()):
+        parts = sorted(folder.glob("*.part"))
+        known = [
+            f.name
+            for f in sorted(folder.iterdir())
+            if f.suffix.lower() in (".npz", ".mp4", ".gif", ".mha", ".toml")
+        ]
+        if known or parts:
+            return {
+                "format": "folder without a report of a run (run.json)",
+                "files": known,
+                "notes": [f"{part.name} is unfinished" for part in parts],
+            }
+    return None
+
+
+def _of_echoes(path: Path) -> dict[str, Any]:
+    echoes = open_echoes(path)
+    rows, lines = echoes.grid.shape[::-1]
+    last = float(echoes.times[-1] - echoes.times[0])
+    return {
+        "format": "echoes.npz: complex baseband",
+        "samples": {"lines": lines, "rows": rows},
+        "spacing_mm": list(echoes.grid.spacing),
+        "size_mm": _size(lines, rows, echoes.grid.spacing),
+        "carrier_per_mm": echoes.carrier,
+        "frames": len(echoes),
+        "duration_s": round(last, 6),
+        "notes": [],
+    }
+
+
+def _of_arrays(path: Path) -> dict[str, Any]:
+    """List the arrays of a Matlab or HDF5 file."""
+    found = list_arrays(path)
+    return {
+        "arrays": {a.name: [*a.shape, a.type] for a in found},
+        "notes": [
+            "pixels or lines: `echospline track FILE --rf MHZ --variable NAME` reads an array of RF lines"
+        ],
+    }
 
 
 def _of_sample(name: str) -> dict[str, Any]:
@@ -109,7 +237,7 @@ def _of_sample(name: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _of_recording(recording: Recording) -> dict[str, Any]:
+def _of_recording(recording: Recording, limit: float) -> dict[str, Any]:
     left, top, right, bottom = recording.region or (0, 0, recording.columns, recording.rows)
     about: dict[str, Any] = {
         "format": recording.format,
@@ -119,9 +247,7 @@ def _of_recording(recording: Recording) -> dict[str, Any]:
             "channels": recording.channels,
             "type": str(recording.dtype),
         },
-        "decoded_mib": round(
-            recording.rows * recording.columns * recording.dtype.itemsize * recording.frames / MIB, 2
-        ),
+        "decoded_mib": round(recording.decoded_mib, 2),
         "spacing_mm": list(recording.spacing) if recording.spacing else None,
         "frames": recording.frames,
     }
@@ -129,19 +255,21 @@ def _of_recording(recording: Recording) -> dict[str, Any]:
         about["region"] = [left, top, right, bottom]
     if recording.spacing:
         about["size_mm"] = _size(right - left, bottom - top, recording.spacing)
-    if recording.frames > 1:
-        times = recording.times
-        last = float(times[-1]) if times is not None else None
+    if recording.frames > 1 and not recording.volume:
+        times, kept = recording.times, recording.kept
+        last = float(np.ptp(times[kept])) if times is not None and len(kept) else None
         about["duration_s"] = round(last, 6) if last is not None else None
-        about["fps"] = round((recording.frames - 1) / last, 3) if last else None
+        about["fps"] = round((len(kept) - 1) / last, 3) if last else None
     if recording.regions:
         about["regions"] = [
             {"content": r.content, "box": list(r.box), "spacing_mm": list(r.spacing) if r.spacing else None}
             for r in recording.regions
         ]
+    if recording.volume:
+        about["slices"] = about.pop("frames")
     about["notes"] = [
         *recording.notes,
-        *_missing(recording),
+        *_missing(recording, limit),
         *_size_doubts(right - left, bottom - top, recording),
     ]
     return about
@@ -157,12 +285,20 @@ def _size_doubts(columns: int, rows: int, recording: Recording) -> list[str]:
         return [str(error)]
 
 
-def _missing(recording: Recording) -> list[str]:
+def _missing(recording: Recording, limit: float) -> list[str]:
     notes = []
     if recording.spacing is None:
         notes.append("no spacing: give --spacing LAT,DEPTH in mm per pixel")
-    if recording.frames > 1 and recording.times is None:
-        notes.append("no frame times: give --fps in frames per second, or --frame to take one")
+    if recording.volume:
+        notes.append("give --frame to take one slice, or --fps if the third axis is time")
+    elif recording.frames > 1 and recording.times is None:
+        why = f" ({recording.untimed})" if recording.untimed else ""
+        notes.append(f"no frame times{why}: give --fps in frames per second, or --frame to take one")
+    if recording.decoded_mib > limit:
+        notes.append(
+            f"all frames together take {recording.decoded_mib:,.0f} MiB, more than the limit of {limit:,.0f} MiB: they are "
+            "read one by one (open_cine, track)"
+        )
     return notes
 
 
@@ -197,7 +333,7 @@ def _of_toml(path: Path) -> dict[str, Any]:
             f"{path} has {path.stat().st_size:,} bytes; a scenario has {scenario_room.LARGEST_FILE:,} at most"
         )
     try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
+        document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path} is no valid TOML: {' '.join(str(error).split())}") from error
     if not set(document) & set(scenario_room.Scenario.model_fields):
@@ -259,7 +395,11 @@ _SHOWN: dict[str, Callable[[Any], list[str]]] = {
     "speed_mm_s": lambda v: [f"{v[0]:.6g} to {v[1]:.6g}"],
     "region": _shown_box,
     "regions": _shown_regions,
-    "arrays": lambda v: [f"{name} {tuple(shape)}" for name, shape in v.items()],
+    "arrays": lambda v: [f"{name} ({', '.join(map(str, shape))})" for name, shape in v.items()],
+    "samples": lambda v: (
+        [f"{v['lines']} lines of {v['rows']} samples"] if isinstance(v, dict) else [f"{v:,}"]
+    ),
+    "files": lambda v: [", ".join(v)] if v else [],
     "tables": lambda v: [f"{name}: {_short(part)}" for name, part in v.items()],
     "notes": lambda v: [str(note) for note in v],
 }

@@ -159,15 +159,22 @@ def link(
     )
     if not options.host and not options.connect:
         raise InputError("nothing to do: with --no-serve give --connect HOST:PORT")
-    stage = make_stage(scenario, folder, orientation, rate, [_point(text) for text in target or ()])
 
-    say(scenario_room.size_doubts(stage.image.grid))
+    def staged(
+        chosen: scenario_room.Scenario, start: Path, points: list[tuple[float, float]]
+    ) -> openigtlink.Stage:
+        made = make_stage(chosen, start, orientation, rate, points)
+        say([*made.image.notes, *chosen.label_notes(start)], "note")
+        say(scenario_room.size_doubts(made.image.grid))
+        return made
+
+    stage = staged(scenario, folder, [_point(text) for text in target or ()])
 
     def load_named(name: str) -> openigtlink.Stage:
         assert scenarios is not None  # otherwise it is not passed on
         if Path(name).name != name or not name.endswith(".toml"):
             raise InputError(f"a scenario is named NAME.toml, without folders; got {name!r}")
-        return make_stage(scenario_room.load(scenarios / name), scenarios, orientation, rate, [])
+        return staged(scenario_room.load(scenarios / name), scenarios, [])
 
     # An engine's step is short: more threads make it slower and less punctual.
     with (
@@ -239,7 +246,7 @@ def oriented(image: scene_room.UltrasoundImage, orientation: str) -> scene_room.
         pixels = pixels[:, ::-1]
     if orientation[1] == "N":
         pixels = pixels[::-1]
-    return scene_room.UltrasoundImage(np.ascontiguousarray(pixels), image.grid, image.source)
+    return scene_room.UltrasoundImage(np.ascontiguousarray(pixels), image.grid, image.source, image.notes)
 
 
 def _summary(stage: openigtlink.Stage) -> str:

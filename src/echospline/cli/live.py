@@ -132,7 +132,8 @@ def live(
     from threadpoolctl import threadpool_limits
 
     scenario, folder = scenario_from(source, changes or {})
-    image = scenario.read_image(folder)
+    scenario, image = scenario.opened(folder, eight_bit=True)
+    say([*image.notes, *scenario.label_notes(folder)], "note")
     say(scenario_room.size_doubts(image.grid))
     scene = scene_of(scenario, image, folder)
     settings = viewer.Settings(
@@ -227,11 +228,11 @@ def opener_for(
     """Build a function that turns uploaded images into scenes with the tissue, mesh and model of a scenario."""
 
     def opened(path: Path, spacing: tuple[float, float] | None) -> viewer.Scene:
-        values: dict[str, Any] = {"title": "Your image", "image.file": str(path), "image.spacing": spacing, "image.frame": 0,
+        values: dict[str, Any] = {"title": "Your image", "image.file": str(path), "image.spacing": spacing, "image.frame": None, "image.window": None,
                   "image.region": None, "tissue.region": [], "mesh.clamped_points": [], "exercise": []}  # fmt: skip
         bare = scenario.with_values(values, "upload")
         io_room.open_recording(path, LARGEST_UPLOAD, whole=False)  # refuses a bomb by its header
-        image = bare.read_image(path.parent)
+        bare, image = bare.opened(path.parent, eight_bit=True)
         x0, x1, y0, _ = bare.grid(image).extent
         return scene_of(bare.with_values({"needle.entry": (x0 + 0.2 * (x1 - x0), y0)}), image, path.parent)
 

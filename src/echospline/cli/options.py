@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, Literal, get_type_hints
 
 import typer
 from typer.core import TyperCommand, TyperOption
@@ -47,6 +47,14 @@ def _edges(text: str) -> list[str]:
     return [] if text.strip() == "none" else _words(text)
 
 
+def _probe(text: str) -> dict[str, Any]:
+    numbers = _numbers(text)
+    if len(numbers) not in (3, 6):
+        raise ValueError
+    turned = dict(zip(("yaw", "pitch", "roll"), numbers[3:], strict=False))
+    return {"position": numbers[:3], "view": None, **turned}
+
+
 def _border(text: str) -> float | str:
     return text if text == "transparent" else float(text)
 
@@ -72,6 +80,7 @@ OPTIONS = (
     Option("--spacing", "image.spacing", "LAT,DEPTH", _numbers, "Image"),
     Option("--frame", "image.frame", "N", int, "Image"),
     Option("--region", "image.region", "L,T,R,B", integers, "Image"),
+    Option("--window", "image.window", "LOW,HIGH", _numbers, "Image"),
     Option("--mesh", "mesh.nodes", "NXxNY", _nodes, "Mesh"),
     Option("--clamped", "mesh.clamped", "EDGE,...", _words, "Mesh"),
     Option("--sliding", "mesh.sliding", "EDGE,...|none", _edges, "Mesh"),
@@ -115,10 +124,15 @@ OPTIONS = (
     Option("--poisson", "tissue.poisson", "NU", None, "Model fem, green"),
     Option("--material", "tissue.material", "linear|neo-hookean", None, "Model fem"),
     Option("--thickness", "tissue.thickness", "MM", None, "Model fem, green"),
+    Option("--depth-axis", "space.depth_axis", "AXIS", None, "Space"),
+    Option("--view", "space.probe.view", "longitudinal|transverse", None, "Space"),
+    Option("--probe", "space.probe", "X,Y,Z[,YAW,PITCH,ROLL]", _probe, "Space"),
+    Option("--needle-entry", "space.needle.entry", "X,Y,Z", _numbers, "Space"),
+    Option("--needle-direction", "space.needle.direction", "X,Y,Z", _numbers, "Space"),
+    Option("--needle-depth", "space.needle.depth", "MM", None, "Space"),
     Option("--fps", "output.fps", "N", None, "Output"),
     Option("--formats", "output.formats", "NAME,...", _words, "Output"),
     Option("--border", "output.border", "VALUE", _border, "Output"),
-    Option("--window", "output.window", "LOW,HIGH", _numbers, "Output"),
     Option("--folding", "output.folding", "flag|refuse", None, "Output"),
     Option("--image-model", "output.image_model", "warp|rescatter", None, "Output"),
     Option("--needle/--no-needle", "output.needle", "", None, "Output"),
@@ -163,10 +177,10 @@ def with_scenario_options(command: Callable[..., None]) -> Callable[..., None]:
     return wrapped
 
 
-def say(doubts: Iterable[str]) -> None:
-    """Print doubts on stderr, one line each."""
-    for doubt in doubts:
-        print(f"echospline: doubt: {doubt}", file=sys.stderr)
+def say(sentences: Iterable[str], kind: Literal["doubt", "note"] = "doubt") -> None:
+    """Print sentences on stderr, each once, one line each: doubts about the scale of a scene, or notes of the readers of its files."""
+    for sentence in dict.fromkeys(sentences):
+        print(f"echospline: {kind}: {sentence}", file=sys.stderr)
 
 
 class ScenarioCommand(TyperCommand):
@@ -201,13 +215,23 @@ def scenario_from(source: str, changes: dict[str, Any]) -> tuple[scenario_room.S
         scenario, folder = scenario_room.Scenario(), Path.cwd()
         changes = {"image.file": source, **changes}
     try:
-        return scenario.with_values({k: _read(k, v) for k, v in changes.items()}, "options"), folder
+        return scenario.with_values(_flat({k: _read(k, v) for k, v in changes.items()}), "options"), folder
     except InputError as error:  # the message names the user's flag, not the key
         flag = next(
             (o.flag for o in OPTIONS if str(error).startswith(f"options: {o.key}") and o.key in changes), None
         )
         key = next((o.key for o in OPTIONS if o.flag == flag), "")
         raise InputError(str(error).replace(f"options: {key}", str(flag)) if flag else str(error)) from None
+
+
+def _flat(values: dict[str, Any]) -> dict[str, Any]:
+    """Spread an option that stands for several keys of a table over them."""
+    spread: dict[str, Any] = {}
+    for key, value in values.items():
+        spread |= (
+            {f"{key}.{name}": v for name, v in value.items()} if isinstance(value, dict) else {key: value}
+        )
+    return spread
 
 
 def _name(option: Option) -> str:

@@ -75,7 +75,12 @@ def phantom_into(
 
     # the resolved scenario names its own picture, so that simulate and identify use the same mesh
     scenario = scenario.with_values(
-        {"image.file": scenario_room.PHANTOM, "image.region": None, "image.spacing": None}
+        {
+            "image.file": scenario_room.PHANTOM,
+            "image.region": None,
+            "image.spacing": None,
+            "image.window": None,
+        }
     )
     section, probe = scenario.phantom, scenario.probe.probe()
     scattered = section.phantom(probe)
@@ -84,7 +89,7 @@ def phantom_into(
     image = scene_room.UltrasoundImage(
         still.b_mode(display, scattered.grid).pixels, scattered.grid, "speckle phantom"
     )
-    scenario, doubts = scenario_room.prepared(scenario, image, out)
+    doubts = scenario_room.check(scenario, image, out)
     say(doubts)
     model = scenario_room.build_model(scenario, scenario.grid(image), folder=folder)
     count = picture_room.frame_count(scenario.insertion(), scenario.output.fps)

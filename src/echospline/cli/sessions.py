@@ -110,8 +110,9 @@ def cine(
         session.upload and beside.is_file()
     ):  # the sessions may have been moved, with their pictures beside them
         scenario = scenario.with_values({"image.file": str(beside.resolve())}, f"session {number}")
-    image = scenario.read_image(folder)
-    scenario, doubts = scenario_room.prepared(scenario, image, out)
+    scenario, image = scenario.opened(folder, eight_bit=None)
+    say([*image.notes, *scenario.label_notes(folder)], "note")
+    doubts = scenario_room.check(scenario, image, out)
     say(doubts)
     model = scenario_room.build_model(scenario, scenario.grid(image), folder=folder)
     with claimed(out):

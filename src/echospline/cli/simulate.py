@@ -54,8 +54,12 @@ def demo(out: Out = Path("out/demo"), json_: Json = False) -> None:
 def simulate_into(source: str, out: Path, changes: dict[str, Any], *, as_json: bool) -> None:
     """Run a scenario with a progress bar on a terminal, and print a summary."""
     scenario, folder = scenario_from(source, changes)
-    image = scenario.read_image(folder)
-    scenario, doubts = scenario_room.prepared(scenario, image, out)
+    if scenario_room.is_spatial(scenario):
+        _simulate_space(scenario, folder, out, as_json=as_json)
+        return
+    scenario, image = scenario.opened(folder, eight_bit=None)
+    say([*image.notes, *scenario.label_notes(folder)], "note")
+    doubts = scenario_room.check(scenario, image, out)
     say(doubts)
     model = scenario_room.build_model(scenario, scenario.grid(image), folder=folder)
     from rich.console import Console
@@ -85,6 +89,40 @@ def simulate_into(source: str, out: Path, changes: dict[str, Any], *, as_json: b
             form_image=_image_former(scenario, image),
             doubts=doubts,
         )
+    if as_json:
+        json.dump(report, sys.stdout, indent=2)
+        print()
+        return
+    _print_summary(report, out)
+
+
+def _simulate_space(scenario: scenario_room.Scenario, folder: Path, out: Path, *, as_json: bool) -> None:
+    """Run a scene in space with a progress bar on a terminal, and print a summary."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from echospline.scenario.run_space import run_space
+    from echospline.scenario.space_models import build_spatial_model
+
+    opened = scenario_room.open_spatial(scenario, folder)
+    say(opened.notes, "note")
+    space = opened.scenario.space
+    assert space is not None
+    model = build_spatial_model(opened.scenario, space.grid(opened.volume), opened.tissue)
+    console = Console(stderr=True)
+    columns = (TextColumn("simulating"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    quiet = as_json or not console.is_terminal
+    with claimed(out), Progress(*columns, console=console, transient=True, disable=quiet) as bar:
+        task = bar.add_task("simulating", total=None)
+        report = run_space(
+            opened.scenario,
+            opened.volume,
+            model,
+            out,
+            folder,
+            progress=lambda done, count: bar.update(task, completed=done, total=count),
+        )
+    say(report["doubts"])
     if as_json:
         json.dump(report, sys.stdout, indent=2)
         print()

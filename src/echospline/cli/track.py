@@ -7,23 +7,30 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import typer
 
+from echospline import io as io_room
 from echospline import scenario as scenario_room
 from echospline import tracking
 from echospline.cli.options import say
 from echospline.errors import InputError
-from echospline.io import head, read, read_echoes, read_needle
-from echospline.scene import Cine, Echo, EchoCine, Floats, NeedlePose, RegularGrid
+from echospline.io import LIMIT, MIB
+from echospline.scene import Cine, Echo, EchoCine, Floats, NeedlePose, RegularGrid, UltrasoundImage
+
+if TYPE_CHECKING:
+    from echospline.cli.track_frames import FileFrames
 
 
 def track(
     cine: Annotated[
         str,
-        typer.Argument(metavar="CINE", help="echoes.npz of a phantom, or a cine of any readable format"),
+        typer.Argument(
+            metavar="CINE",
+            help="echoes.npz of a phantom, a cine of any readable format, or RF lines in a Matlab or HDF5 file",
+        ),
     ],
     out: Annotated[Path, typer.Option("--out", help="FIELD: .npz or .mha")] = Path("out/track.npz"),
     spacing: Annotated[
@@ -40,6 +47,32 @@ def track(
         typer.Option("--rf", metavar="MHZ", help="the cine holds RF lines of this centre frequency"),
     ] = None,
     sound_speed: Annotated[float, typer.Option(metavar="MM_US", help="with --rf: mm/us")] = 1.54,
+    variable: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME", help="with --rf: the array in a Matlab or HDF5 file, NAME{1} for a cell"
+        ),
+    ] = None,
+    axes: Annotated[
+        str | None,
+        typer.Option(
+            metavar="A,B,C",
+            help="with --rf: its axes; depth,line,frame in Matlab files and frame,depth,line in HDF5 where not given",
+        ),
+    ] = None,
+    channels: Annotated[
+        float | None,
+        typer.Option(
+            metavar="MM",
+            help="with --rf: it holds channel data of plane waves sent straight ahead, elements so far apart",
+        ),
+    ] = None,
+    sampling: Annotated[
+        float | None, typer.Option(metavar="MHZ", help="with --rf: samples per us, where the file has no fs")
+    ] = None,
+    start: Annotated[
+        float, typer.Option(metavar="US", help="with --channels: time of the first sample after transmission")
+    ] = 0.0,
     grid: Annotated[float, typer.Option(metavar="MM", help="distance of the tracked points")] = 0.5,
     roi: Annotated[
         str | None, typer.Option(metavar="X0,Y0,X1,Y1", help="track inside this box only, mm")
@@ -67,6 +100,9 @@ def track(
     preview: Annotated[
         Path | None, typer.Option(metavar="PNG", help="picture with arrows; beside FIELD where not given")
     ] = None,
+    limit: Annotated[
+        float, typer.Option(min=1, metavar="MIB", help="most memory for frames and track, MiB")
+    ] = LIMIT,
     json_: Annotated[bool, typer.Option("--json", help="print the report as JSON, nothing else")] = False,
 ) -> None:
     """Track the motion of tissue through a cine.
@@ -78,11 +114,29 @@ def track(
     from rich.console import Console
     from rich.progress import track as counted
 
+    from echospline.cli.track_frames import Lines, open_frames
+
     began = perf_counter()
-    frames = load(cine, spacing=spacing, fps=fps, crop=crop, rf=rf, sound_speed=sound_speed)
+    given = {"--variable": variable, "--axes": axes, "--channels": channels, "--sampling": sampling}
+    if rf is None and (extra := next((flag for flag, value in given.items() if value is not None), None)):
+        raise InputError(f"{extra} describes RF lines: give --rf MHZ, their centre frequency, too")
+    lines = None if rf is None else Lines(
+        positive(rf, "--rf"), positive(sound_speed, "--sound-speed"), variable,
+        None if axes is None else tuple(part.strip() for part in axes.split(",")),
+        None if channels is None else positive(channels, "--channels"),
+        None if sampling is None else positive(sampling, "--sampling"), start,
+    )  # fmt: skip
+    frames = open_frames(
+        cine,
+        spacing=None if spacing is None else numbers(spacing, 2, "--spacing"),
+        fps=None if fps is None else positive(fps, "--fps"),
+        crop=None if crop is None else [int(v) for v in numbers(crop, 4, "--crop")],
+        lines=lines,
+        limit=limit,
+    )
+    say(frames.notes, "note")
     say(scenario_room.size_doubts(frames.grid, "--spacing"))
-    scenario_room.check_points(frames.grid, grid, len(frames), "--grid")
-    path = None if needle is None else read_needle(needle)
+    path = None if needle is None else io_room.read_needle(needle)
     if path is not None:
         say(scenario_room.needle_doubts(path, frames.grid))
     poses = None if path is None else [path.pose(t) for t in frames.times]
@@ -91,11 +145,22 @@ def track(
     if ahead is not None and out.suffix.lower() == ".mha":
         raise InputError("--ahead tracks scattered points, which .mha cannot hold: write .npz")
     box = None if roi is None else numbers(roi, 4, "--roi")
-    points = (
-        tracking.grid_over(frames.grid.extent, grid, box).nodes
+    chosen = (
+        tracking.grid_over(frames.grid.extent, grid, box)
         if ahead is None
         else swept(poses or [], ahead, frames.grid)
     )
+    # a grid knows how many points it has before they are laid out
+    count = chosen.size if isinstance(chosen, RegularGrid) else len(chosen)
+    need = frames.mib(count)
+    if need > limit:
+        raise InputError(
+            f"tracking {count:,} points in {len(frames)} frames needs about {need:,.0f} MiB, more than the limit of "
+            f"{limit:,.0f} MiB: choose a wider --grid, a smaller --roi, or raise --limit"
+        )
+    if not json_:
+        say([f"{count:,} points in {len(frames)} frames: about {need:,.0f} MiB"], "note")
+    points = chosen.nodes if isinstance(chosen, RegularGrid) else chosen
     wrap: Any = (
         iter
         if json_
@@ -127,7 +192,7 @@ def track(
         return
     Console().print(
         f"{report['points']} points in {report['frames']} frames in {report['seconds']:.1f} s, {report['keyframes']} keyframes; "
-        f"largest trusted motion {report['largest_mm']:.3f} mm, {report['trusted']:.0%} trusted; wrote {out} and {picture}"
+        f"largest trusted motion {report['largest_mm']:.3f} mm, {report['trusted']:.0%} trusted, {report['trusted_last_frame']:.0%} in the last frame; wrote {out} and {picture}"
     )
 
 
@@ -140,23 +205,34 @@ def load(
     rf: float | None = None,
     sound_speed: float = 1.54,
 ) -> Cine | EchoCine:
-    """Read a cine of pictures or of echoes."""
-    if not cine.startswith("sample:") and Path(cine).is_file() and head(Path(cine)).startswith(b"PK"):
-        return read_echoes(cine)
-    found = read(
+    """Read a whole cine of pictures or of echoes; echoes in units of the first frame's root mean square."""
+    from echospline.cli.track_frames import Lines, open_frames
+
+    frames = open_frames(
         cine,
         spacing=None if spacing is None else numbers(spacing, 2, "--spacing"),
         fps=fps,
-        region=None if crop is None else [int(v) for v in numbers(crop, 4, "--crop")],
+        crop=None if crop is None else [int(v) for v in numbers(crop, 4, "--crop")],
+        lines=None if rf is None else Lines(rf, sound_speed),
     )
-    if not isinstance(found, Cine) or len(found) < 2:
-        raise InputError(f"{cine} holds one image; tracking needs a cine of two frames or more")
-    if rf is None:
-        return found
-    carrier = 2.0 * rf / sound_speed
-    iq = np.stack([Echo.from_rf(f, found.grid, carrier).iq for f in found.frames])
-    level = float(np.sqrt(np.mean(np.abs(iq[0]) ** 2)))
-    return EchoCine(iq / max(level, 1e-30), found.times, found.grid, carrier)
+    if (size := frames.grid.size * len(frames) * 8 / MIB) > LIMIT:
+        raise InputError(f"{cine} needs about {size:,.0f} MiB at once, more than {LIMIT:,.0f} MiB: cut it")
+    kept = list(frames)
+    echoes = [frame for frame in kept if isinstance(frame, Echo)]
+    if not echoes:
+        pictures = [frame for frame in kept if isinstance(frame, UltrasoundImage)]
+        stack = np.stack([picture.pixels for picture in pictures])
+        return Cine(stack, frames.times, frames.grid, pictures[0].source, frames.notes)
+    iq = np.stack([echo.iq for echo in echoes])
+    level = float(np.sqrt(np.mean(np.abs(iq[0]).astype(np.float64) ** 2))) if rf is not None else 1.0
+    return EchoCine(iq / level if level > 0 else iq, frames.times, frames.grid, echoes[0].carrier)
+
+
+def positive(value: float, option: str) -> float:
+    """Refuse a number that is not positive."""
+    if not (np.isfinite(value) and value > 0):
+        raise InputError(f"{option} takes a positive number; got {value}")
+    return value
 
 
 def tracker(method: str) -> tracking.Tracker:
@@ -202,26 +278,27 @@ def swept(poses: Iterable[NeedlePose], distance: float, grid: RegularGrid) -> Fl
 
 
 def summary(found: tracking.Track, seconds: float) -> dict[str, Any]:
-    """Print a summary of the motion."""
+    """Summarise the motion; frame 0, which is not measured, does not count as trusted."""
     trusted = found.confidence >= 0.3
     size = np.hypot(found.displacement[..., 0], found.displacement[..., 1])
     return {
         "frames": len(found.times),
         "points": len(found.points),
         "keyframes": len(found.keyframes),
-        "trusted": float(trusted.mean()),
+        "trusted": float(trusted[1:].mean()) if len(trusted) > 1 else 0.0,
         "trusted_last_frame": float(trusted[-1].mean()),
         "largest_mm": float(size[trusted].max(initial=0.0)),
         "seconds": round(seconds, 3),
     }
 
 
-def draw(frames: Cine | EchoCine, found: tracking.Track, poses: list[NeedlePose] | None, path: Path) -> None:
+def draw(frames: FileFrames, found: tracking.Track, poses: list[NeedlePose] | None, path: Path) -> None:
     """Draw the arrows of the frame that moved most over the first picture."""
     # matplotlib is slow to load
     from echospline.picture.summary import tracking_figure
 
-    grey, _, grid = tracking.grey_pair(frames[0], frames[0])
+    first = next(iter(frames))
+    grey, _, grid = tracking.grey_pair(*tracking.levelled(first, first))
     size = np.hypot(found.displacement[..., 0], found.displacement[..., 1]) * (found.confidence >= 0.3)
     k = int(size.max(axis=1).argmax())
     tracking_figure(

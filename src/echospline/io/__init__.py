@@ -3,36 +3,55 @@
 `sequence` is imported by its own name: it loads SimpleITK.
 """
 
+from echospline.io.arrays import ArrayInfo, LineCine, list_arrays, open_lines
 from echospline.io.displacement import (
     DisplacementRecord,
     DisplacementWriter,
     displacement_shapes,
     read_displacement,
 )
-from echospline.io.echoes import EchoWriter, read_echoes
-from echospline.io.kind import head, kind_of
+from echospline.io.echoes import EchoStream, EchoWriter, open_echoes, read_echoes
+from echospline.io.kind import PICTURES, head, kind_of
 from echospline.io.needle_path import read_needle
-from echospline.io.reading import SAMPLE, CineStream, open_cine, open_recording, read, read_image
+from echospline.io.reading import (
+    SAMPLE,
+    CineStream,
+    choose_image,
+    open_cine,
+    open_recording,
+    read,
+    read_image,
+)
 from echospline.io.recording import LIMIT, MIB, Recording, decoding
 from echospline.io.samples import SAMPLES, sample_image
-from echospline.io.writing import CineWriter, open_writer
+from echospline.io.writing import TRANSPARENT, CineWriter, needs_window, open_writer
 
 __all__ = [
     "LIMIT",
     "MIB",
+    "PICTURES",
     "SAMPLE",
     "SAMPLES",
+    "TRANSPARENT",
+    "ArrayInfo",
     "CineStream",
     "CineWriter",
     "DisplacementRecord",
     "DisplacementWriter",
+    "EchoStream",
     "EchoWriter",
+    "LineCine",
     "Recording",
+    "choose_image",
     "decoding",
     "displacement_shapes",
     "head",
     "kind_of",
+    "list_arrays",
+    "needs_window",
     "open_cine",
+    "open_echoes",
+    "open_lines",
     "open_recording",
     "open_writer",
     "read",

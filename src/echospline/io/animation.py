@@ -44,6 +44,8 @@ def _gif_delays(data: bytes | mmap.mmap) -> Iterator[float | None]:
             yield delay
             delay = None
             at = _blocks_end(data, at + 1 + _GIF_IMAGE.size + _table(data[at + _GIF_IMAGE.size]) + 1)
+        elif data[at] == 0:  # stray zeros between blocks are common
+            at += 1
         else:  # the trailer, or nothing that belongs to a GIF
             return
 

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from echospline.errors import InputError
-from echospline.io.kind import kind_of
+from echospline.io.declared import Clock, Declared, followed
+from echospline.io.kind import PICTURES, kind_of
 from echospline.io.recording import Recording, check_size, decoding
 from echospline.io.still import open_picture
-from echospline.scene import Floats, Pixels
+from echospline.scene import Pixels
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 _TABLE = "times.csv"
 _MOST_TABLE = 2**24
 """Bytes of ``times.csv``; half a million frames fit."""
@@ -39,7 +39,7 @@ def open_folder(path: Path, limit: float, *, whole: bool) -> Recording:
         If there is no picture, one differs in size or type, or ``times.csv`` does not fit.
     """
     files = sorted(
-        (f for f in path.iterdir() if f.suffix.lower() in SUFFIXES and f.is_file()), key=_by_number
+        (f for f in path.iterdir() if f.suffix.lower() in PICTURES and f.is_file()), key=_by_number
     )
     if not files:
         raise InputError(
@@ -60,10 +60,12 @@ def open_folder(path: Path, limit: float, *, whole: bool) -> Recording:
                     )
             yield from picture.decode(0, colour)
 
-    return replace(
-        first, path=path, format=f"folder of {first.format}", frames=len(files), decode=decode,
-        times=_times(path, len(files)), single=False,
-    )  # fmt: skip
+    stored = replace(
+        first, path=path, format=f"folder of {first.format}", frames=len(files), decode=decode, single=False
+    )
+    # the pictures are turned and scaled already: their times alone are left to follow
+    said = Declared(clocks=_clocks(path, len(files)))
+    return replace(followed(stored, said), spacing=first.spacing, aspect=first.aspect)
 
 
 def _opened(file: Path, limit: float) -> Recording:
@@ -82,16 +84,16 @@ def _by_number(file: Path) -> tuple[list[tuple[int, str]], str]:
     return [(int(p), "") if p.isdecimal() and p.isascii() else (-1, p) for p in parts], file.name
 
 
-def _times(path: Path, frames: int) -> Floats | None:
-    """Return the seconds since the first frame, from the last column of ``times.csv``; None when there is no such file."""
+def _clocks(path: Path, frames: int) -> tuple[Clock, ...]:
+    """Return the last column of ``times.csv``, s; nothing when there is no such file."""
     table = path / _TABLE
     if not table.is_file():
-        return None
+        return ()
     if table.stat().st_size > _MOST_TABLE:
         raise InputError(f"{table} has more than {_MOST_TABLE} bytes: it is no table of times")
     with decoding(table, "times.csv"):
         rows = np.loadtxt(table, delimiter=",", skiprows=1, ndmin=2)
-    times: Floats = rows[:, -1] - rows[0, -1] if len(rows) else np.empty(0)
+    times = rows[:, -1] if len(rows) else np.empty(0)
     if len(times) != frames or not np.isfinite(times).all() or (np.diff(times) < 0).any():
         raise InputError(f"{table} must hold one ascending time in s for each of the {frames} pictures")
-    return times
+    return (Clock(_TABLE, times),)

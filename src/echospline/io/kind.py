@@ -5,13 +5,19 @@ from __future__ import annotations
 import os
 import re
 import stat
+import struct
 import zlib
 from pathlib import Path
 from typing import Literal
 
 from echospline.errors import InputError
 
-Kind = Literal["picture", "gif", "dicom", "metaimage", "nrrd", "nifti", "video", "displacement", "toml"]
+Kind = Literal[
+    "picture", "gif", "dicom", "metaimage", "nrrd", "nifti", "video", "displacement", "toml", "arrays"
+]
+
+PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+"""Suffixes of the pictures of a cine that is a folder."""
 
 HEAD = 4096
 """Bytes read; every signature below lies within them."""
@@ -25,13 +31,10 @@ _PICTURES = {
     b"MM\x00+": "TIFF",
     b"BM": "BMP",
 }
+_ARRAYS = {b"MATLAB 5.0": "Matlab 5", b"MATLAB 7.3": "Matlab 7.3 (HDF5)", b"\x89HDF\r\n\x1a\n": "HDF5"}
 _STRANGERS = {
     b"%PDF": "a PDF document",
-    b"\x08\x00\x05\x00": "DICOM without its preamble (convert it to a DICOM part 10 file)",
-    b"\x08\x00\x00\x00": "DICOM without its preamble (convert it to a DICOM part 10 file)",
     b"PK\x03\x04": "a zip archive",
-    b"\x89HDF\r\n\x1a\n": "an HDF5 file (Matlab 7.3 files are such)",
-    b"MATLAB 5.0": "a Matlab file",
     b"\x93NUMPY": "a single NumPy array",
     b"BZh": "a bzip2 archive",
     b"7z\xbc\xaf": "a 7-zip archive",
@@ -86,6 +89,7 @@ def kind_of(path: Path) -> tuple[Kind, str]:
         If the file cannot be read or is of no known kind.
     """
     start = head(path)
+    start = start.removeprefix(b"\xef\xbb\xbf")  # a byte-order mark before text
     found = _by_magic(start) or _by_structure(start, path)
     if found:
         return found
@@ -101,6 +105,9 @@ def _by_magic(start: bytes) -> tuple[Kind, str] | None:
     for magic, name in _PICTURES.items():
         if start.startswith(magic):
             return "picture", name
+    for magic, name in _ARRAYS.items():
+        if start.startswith(magic):
+            return "arrays", name
     if start[:6] in (b"GIF87a", b"GIF89a"):
         return "gif", "GIF"
     return ("nrrd", "NRRD") if start.startswith(b"NRRD0") else None
@@ -108,6 +115,8 @@ def _by_magic(start: bytes) -> tuple[Kind, str] | None:
 
 def _by_structure(start: bytes, path: Path) -> tuple[Kind, str] | None:
     video = _video(start)
+    if _is_bare_dicom(start):
+        return "dicom", "DICOM"
     kinds: tuple[tuple[bool, Kind, str], ...] = (
         (
             _is_nifti(start) or (start.startswith(b"\x1f\x8b") and _is_nifti(_inflated(start))),
@@ -130,6 +139,35 @@ def _video(start: bytes) -> str | None:
     if start[:4] == b"\x1a\x45\xdf\xa3":
         return "WebM" if b"webm" in start[:64] else "Matroska"
     return None
+
+
+def _is_bare_dicom(start: bytes) -> bool:
+    """Test for DICOM without its preamble: two elements in a row of group 0002 or 0008, little or big endian."""
+    if len(start) < 16:
+        return False
+    for order in ("<", ">"):
+        group, element = struct.unpack_from(order + "HH", start)
+        if group not in (0x0002, 0x0008) or element > 0x3000:
+            continue
+        kind, short, (long,) = (
+            start[4:6],
+            struct.unpack_from(order + "H", start, 6)[0],
+            struct.unpack_from(order + "I", start, 4),
+        )
+        explicit = kind.isalpha() and kind.isupper()
+        if explicit and kind in _LONG:
+            continue
+        after = 8 + (short if explicit else long)
+        if after + 4 > len(start):
+            continue
+        following, later = struct.unpack_from(order + "HH", start, after)
+        if following in (group, 0x0008) and (following, later) > (group, element):
+            return True
+    return False
+
+
+_LONG = (b"OB", b"OW", b"OF", b"OD", b"OL", b"SQ", b"UC", b"UN", b"UR", b"UT")
+"""Value representations with a 32-bit length; none of them begins a file."""
 
 
 def _is_metaimage(start: bytes) -> bool:

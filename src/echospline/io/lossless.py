@@ -68,7 +68,12 @@ def lossless_frames(
 def _main(path: str, frame: str) -> None:
     from pydicom.pixels.utils import iter_pixels  # noqa: PLC0415
 
-    for pixels in iter_pixels(path, indices=[int(frame)] if frame else None, decoding_plugin="gdcm"):
+    from echospline.io.dicom.pixels import PREAMBLE_MARK, read_dataset  # noqa: PLC0415
+
+    with open(path, "rb") as file:
+        bare = file.read(132)[128:] != PREAMBLE_MARK
+    source: Any = read_dataset(Path(path)) if bare else path
+    for pixels in iter_pixels(source, indices=[int(frame)] if frame else None, decoding_plugin="gdcm"):
         sys.stdout.buffer.write(np.ascontiguousarray(pixels).data)
 
 

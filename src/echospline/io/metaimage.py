@@ -28,8 +28,8 @@ class MetaImageEncoder:
         Temporary name.
     grid : RegularGrid
         Pixel centres, mm.
-    colour : bool
-        Whether frames are RGB.
+    channels : int
+        Values per pixel: 1 (grey), 3 (RGB) or 4 (RGB and opacity).
     dtype : dtype
         Of the pixels.
     fps : float
@@ -42,11 +42,11 @@ class MetaImageEncoder:
     """
 
     def __init__(
-        self, part: Path, grid: RegularGrid, colour: bool, dtype: np.dtype[np.generic], fps: float
+        self, part: Path, grid: RegularGrid, channels: int, dtype: np.dtype[np.generic], fps: float
     ) -> None:
         if dtype.name not in ELEMENT_TYPES:
             raise InputError(f"MetaImage holds pixels of {', '.join(ELEMENT_TYPES)}; got {dtype}")
-        self._part, self._grid, self._colour = part, grid, colour
+        self._part, self._grid, self._channels = part, grid, channels
         self._dtype = dtype.newbyteorder("<")
         self._interval = 1.0 / fps
         self._times: list[float] = []
@@ -91,7 +91,7 @@ class MetaImageEncoder:
             f"ElementSpacing = {dx!r} {dy!r} {interval:<24.17g}",
             f"DimSize = {nx} {ny} {count:<20d}",
             "Kinds = domain domain list",
-            f"ElementNumberOfChannels = {3 if self._colour else 1}",
+            f"ElementNumberOfChannels = {self._channels}",
             f"ElementType = {ELEMENT_TYPES[self._dtype.name]}",
             "UltrasoundImageOrientation = MFA",
             "UltrasoundImageType = BRIGHTNESS",

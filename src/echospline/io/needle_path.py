@@ -24,7 +24,7 @@ def read_needle(path: str | Path) -> Insertion:
     ----------
     path : str or Path
         CSV with the header ``time_s,entry_x_mm,entry_y_mm,tip_x_mm,tip_y_mm`` and ascending times, in the cine's own
-        coordinates; or a ``displacement.npz``.
+        coordinates, separated by commas, semicolons (then a decimal comma is read too) or tabs; or a ``displacement.npz``.
 
     Raises
     ------
@@ -40,7 +40,9 @@ def read_needle(path: str | Path) -> Insertion:
             f"{path} has {path.stat().st_size} bytes; a needle's path is a CSV file of few lines"
         )
     try:
-        rows = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
+        text = path.read_text(encoding="utf-8-sig")
+        mark = _separator(text)
+        rows = list(csv.reader(text.splitlines(), delimiter=mark))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"cannot read the needle's path {path}: {error}") from error
     rows = [r for r in rows if r and not r[0].lstrip().startswith("#")]
@@ -49,9 +51,21 @@ def read_needle(path: str | Path) -> Insertion:
             f"{path}: the first line must be {','.join(COLUMNS)}; got {','.join(rows[0]) if rows else ''}"
         )
     try:
-        values = np.array([[float(v) for v in row] for row in rows[1:]], dtype=np.float64)
+        values = np.array([[_number(v, mark) for v in row] for row in rows[1:]], dtype=np.float64)
     except ValueError as error:
         raise InputError(f"{path}: every line holds five numbers: {error}") from error
     if values.ndim != 2 or values.shape[1] != len(COLUMNS):
         raise InputError(f"{path}: every line holds five numbers, and there are two lines or more")
     return Insertion(values[:, 0], values[:, 1:3], values[:, 3:5])
+
+
+def _separator(text: str) -> str:
+    """Return the mark between the names of the first line that is no comment."""
+    lines = (line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#"))
+    header = next(lines, "")
+    return next((mark for mark in ";\t" if mark in header), ",")
+
+
+def _number(text: str, mark: str) -> float:
+    """Read a number; where semicolons part the columns, spreadsheets write 0,5 for 0.5."""
+    return float(text.strip().replace(",", ".") if mark == ";" else text)

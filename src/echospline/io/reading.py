@@ -8,8 +8,10 @@ from math import isfinite
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from echospline.errors import InputError
+from echospline.io.declared import aspect_note
 from echospline.io.kind import READABLE, kind_of
 from echospline.io.recording import LIMIT, MIB, Box, Recording, check_size, to_grey
 from echospline.io.samples import SAMPLES, sample_image
@@ -27,32 +29,37 @@ class CineStream:
     grid : RegularGrid
         Pixel centres in mm, the same for every frame.
     frames : int
-        Number of frames.
+        Number of good frames; frames that the file itself calls bad are left out.
     source : str
         File, format and the reader's notes.
+    notes : tuple of str
+        Conclusions and doubts of the reader, one sentence each.
+    times : ndarray, shape (frames,)
+        Seconds since the first good frame.
     """
 
     grid: RegularGrid
     frames: int
     source: str
+    notes: tuple[str, ...]
+    times: Floats
     _recording: Recording
     _box: Box
-    _times: Floats | None
-    _fps: float | None
     _colour: bool
+
+    def __len__(self) -> int:
+        return self.frames
+
+    def images(self) -> Iterator[UltrasoundImage]:
+        """Yield the frames as images."""
+        return (image for _, image in self)
 
     def __iter__(self) -> Iterator[tuple[float, UltrasoundImage]]:
         """Yield (time in s since the first frame, image)."""
-        for i, pixels in enumerate(self._recording.decode(None, self._colour)):
-            time = (
-                i / self._fps if self._fps else float(self._times[i]) if self._times is not None else float(i)
-            )
-            yield (
-                time,
-                UltrasoundImage(
-                    _cropped(self._recording.path, pixels, self._box, self._colour), self.grid, self.source
-                ),
-            )
+        pixels = _good(self._recording, self._colour)
+        for time, frame in zip(self.times, pixels, strict=True):
+            part = _cropped(self._recording.path, frame, self._box, self._colour)
+            yield float(time), UltrasoundImage(part, self.grid, self.source, self.notes)
 
 
 def read(
@@ -100,30 +107,56 @@ def read(
         return _sample(str(path).removeprefix(SAMPLE), spacing, region)
     recording = open_recording(path, limit, whole=frame is None)
     box = _checked_box(recording, region)
-    grid = _grid(recording, box, spacing)
-    source = _source(recording)
+    grid, notes = _grid(recording, box, spacing)
     if recording.single or frame is not None:
-        index = _checked_frame(recording, frame or 0)
-        pixels = next(recording.decode(index, colour))
-        return UltrasoundImage(_cropped(recording.path, pixels, box, colour), grid, source)
-    frames = _gather(recording, box, colour, limit)
-    return Cine(frames, _times(recording, fps, len(frames)), grid, source)
+        return _one(recording, _checked_frame(recording, frame or 0), box, grid, notes, colour)
+    times = _times(recording, fps, "or --frame to take one")
+    return Cine(_gather(recording, box, colour, limit), times, grid, _source(recording, notes), notes)
 
 
 def read_image(
     path: str | Path,
     *,
     spacing: Sequence[float] | None = None,
-    frame: int = 0,
+    frame: int | None = None,
     region: Sequence[int] | None = None,
     colour: bool = False,
     limit: float = LIMIT,
 ) -> UltrasoundImage:
-    """Read one image, of a cine the first unless ``frame`` gives another; parameters as for `read`."""
-    found = read(path, spacing=spacing, frame=frame, region=region, colour=colour, limit=limit)
-    if isinstance(found, Cine):
-        raise InputError(f"{path} holds a cine; expected an image: give a frame number")
-    return found
+    """Read one image; of a cine the first good frame unless ``frame`` gives another; parameters as for `read`.
+
+    Raises
+    ------
+    InputError
+        As for `read`; also if the file is a volume and no slice is named.
+    """
+    return choose_image(path, spacing=spacing, frame=frame, region=region, colour=colour, limit=limit)[0]
+
+
+def choose_image(
+    path: str | Path,
+    *,
+    spacing: Sequence[float] | None = None,
+    frame: int | None = None,
+    region: Sequence[int] | None = None,
+    colour: bool = False,
+    limit: float = LIMIT,
+) -> tuple[UltrasoundImage, int, tuple[float, float] | None]:
+    """Read one image as `read_image` does; returns it, the number of its frame, and the window that the file asks for."""
+    if str(path).startswith(SAMPLE):
+        return _sample(str(path).removeprefix(SAMPLE), spacing, region), 0, None
+    recording = open_recording(path, limit, whole=False)
+    box = _checked_box(recording, region)
+    grid, notes = _grid(recording, box, spacing)
+    chosen = 0 if frame is None else _checked_frame(recording, frame)
+    if frame is None and recording.frames > 1:
+        if recording.volume:
+            raise _is_volume(recording, "give --frame, the number of a slice from 0")
+        chosen = int(_kept(recording)[0])
+        if chosen:
+            notes = (*notes, f"frame {chosen} taken, the first good one")
+    image = _one(recording, chosen, box, grid, notes, colour)
+    return image, chosen, recording.window
 
 
 def open_cine(
@@ -141,12 +174,9 @@ def open_cine(
     """
     recording = open_recording(path, limit, whole=False)
     box = _checked_box(recording, region)
-    if fps is None and recording.times is None and recording.frames != 1:
-        raise _no_times(recording)
-    return CineStream(
-        _grid(recording, box, spacing), recording.frames, _source(recording),
-        recording, box, recording.times, _checked_fps(fps), colour,
-    )  # fmt: skip
+    grid, notes = _grid(recording, box, spacing)
+    times = _times(recording, fps)
+    return CineStream(grid, len(times), _source(recording, notes), notes, times, recording, box, colour)
 
 
 def open_recording(path: str | Path, limit: float = LIMIT, *, whole: bool = True) -> Recording:
@@ -166,6 +196,8 @@ def open_recording(path: str | Path, limit: float = LIMIT, *, whole: bool = True
     InputError
         If the file is missing, damaged, too large or of no known kind.
     """
+    if not str(path).strip():
+        raise InputError("expected a file or folder; got an empty name")
     path = Path(path)
     if not (isfinite(limit) and limit > 0):
         raise InputError(f"limit must be a positive number of MiB; got {limit}")
@@ -192,6 +224,11 @@ def open_recording(path: str | Path, limit: float = LIMIT, *, whole: bool = True
         from echospline.io.video import open_video  # noqa: PLC0415
 
         recording = open_video(path, name, header_limit)
+    elif kind == "arrays":
+        raise InputError(
+            f"{path} ({name}) holds arrays, not pictures; expected {READABLE}: RF lines are read by "
+            "`echospline track FILE --rf MHZ` (open_lines)"
+        )
     elif kind == "displacement":
         raise InputError(
             f"{path} holds arrays (npz), not pictures; expected {READABLE}: use read_displacement"
@@ -230,22 +267,58 @@ def _checked_box(recording: Recording, region: Sequence[int] | None) -> Box:
     return left, top, right, bottom
 
 
-def _grid(recording: Recording, box: Box, spacing: Sequence[float] | None) -> RegularGrid:
+def _grid(
+    recording: Recording, box: Box, spacing: Sequence[float] | None
+) -> tuple[RegularGrid, tuple[str, ...]]:
+    """Return the grid of the box, and the reader's notes with the doubts about the spacing taken."""
     found = tuple(spacing) if spacing is not None else recording.spacing_of(box)
     if found is None:
+        doubted = (note for note in recording.notes if "1 x 1 mm" in note or "no distance of pixels" in note)
+        why = next((f": {note}" for note in doubted), "")
         raise InputError(
-            f"{recording.path} ({recording.format}) does not say how large its pixels are: "
+            f"{recording.path} ({recording.format}) does not say how large its pixels are{why}: "
             "give --spacing LAT,DEPTH in mm per pixel (spacing=(lateral, depth) in Python)"
         )
     shape = (box[2] - box[0], box[3] - box[1])
     if len(found) != 2:
         raise InputError(f"spacing must be two positive numbers in mm (lateral, depth); got {found}")
     dx, dy = found
-    return RegularGrid(shape, (dx, dy))
+    grid = RegularGrid(shape, (dx, dy))
+    doubt = aspect_note(recording.aspect, grid.spacing) if spacing is not None else ""
+    return grid, (*recording.notes, *((doubt,) if doubt else ()))
 
 
-def _source(recording: Recording) -> str:
-    return "; ".join((f"{recording.path.name} ({recording.format})", *recording.notes))
+def _source(recording: Recording, notes: tuple[str, ...]) -> str:
+    return "; ".join((f"{recording.path.name} ({recording.format})", *notes))
+
+
+def _one(
+    recording: Recording,
+    frame: int,
+    box: Box,
+    grid: RegularGrid,
+    notes: tuple[str, ...],
+    colour: bool,
+) -> UltrasoundImage:
+    if recording.valid is not None and not recording.valid[frame]:
+        notes = (*notes, f"frame {frame} was asked for, which the file itself does not call good")
+    pixels = _cropped(recording.path, next(recording.decode(frame, colour)), box, colour)
+    return UltrasoundImage(pixels, grid, _source(recording, notes), notes)
+
+
+def _kept(recording: Recording) -> NDArray[np.intp]:
+    if len(recording.kept) == 0:
+        raise InputError(
+            f"{recording.path} calls none of its {recording.frames} frames good: record it again, or give --frame to take "
+            "one all the same"
+        )
+    return recording.kept
+
+
+def _good(recording: Recording, colour: bool) -> Iterator[Pixels]:
+    """Decode the good frames."""
+    kept = set(_kept(recording).tolist())
+    return (pixels for i, pixels in enumerate(recording.decode(None, colour)) if i in kept)
 
 
 def _checked_frame(recording: Recording, frame: int) -> int:
@@ -263,20 +336,29 @@ def _checked_fps(fps: float | None) -> float | None:
     return fps
 
 
-def _no_times(recording: Recording) -> InputError:
-    return InputError(
-        f"{recording.path} holds {recording.frames} frames but not their times: give --fps in frames per second, "
-        "or --frame to take one"
-    )
+def _is_volume(recording: Recording, remedy: str) -> InputError:
+    why = next((note for note in recording.notes if note.startswith("a volume of")), "a volume")
+    return InputError(f"{recording.path} holds {why}: {remedy}")
 
 
-def _times(recording: Recording, fps: float | None, count: int) -> Floats:
+def _times(recording: Recording, fps: float | None, otherwise: str = "") -> Floats:
+    """Return the seconds of the good frames since the first of them; ``otherwise`` names a second remedy."""
     fps = _checked_fps(fps)
+    kept = _kept(recording)
     if fps is not None:
-        return np.arange(count) / fps
+        return np.asarray((kept - kept[0]) / fps, dtype=np.float64)
+    if recording.frames == 1:
+        return np.zeros(1)
+    also = f", {otherwise}" if otherwise else ""
+    if recording.volume:
+        raise _is_volume(recording, f"give --fps in frames per second if its third axis is time{also}")
     if recording.times is None:
-        raise _no_times(recording)
-    return recording.times[:count]
+        why = f"no usable frame times ({recording.untimed})" if recording.untimed else "not their times"
+        raise InputError(
+            f"{recording.path} holds {recording.frames} frames but {why}: give --fps in frames per second{also}"
+        )
+    since: Floats = recording.times[kept] - recording.times[kept[0]]
+    return since
 
 
 def _cropped(path: Path, pixels: Pixels, box: Box, colour: bool) -> Pixels:
@@ -288,10 +370,11 @@ def _cropped(path: Path, pixels: Pixels, box: Box, colour: bool) -> Pixels:
 
 
 def _gather(recording: Recording, box: Box, colour: bool, limit: float) -> Pixels:
-    """Decode all frames into one array; a file that differs from its header is refused."""
+    """Decode all good frames into one array; a file that differs from its header is refused."""
     frames: Pixels | None = None
+    wanted = len(_kept(recording))
     count = 0
-    for pixels in recording.decode(None, colour):
+    for pixels in _good(recording, colour):
         part = _cropped(recording.path, pixels, box, colour)
         if (count + 1) * part.nbytes > limit * MIB:
             raise InputError(
@@ -299,13 +382,11 @@ def _gather(recording: Recording, box: Box, colour: bool, limit: float) -> Pixel
                 "open_cine, or raise the limit"
             )
         if frames is None:
-            frames = np.empty((recording.frames, *part.shape), part.dtype)
+            frames = np.empty((wanted, *part.shape), part.dtype)
         if count == len(frames) or part.shape != frames.shape[1:]:
             raise InputError(f"{recording.path} holds other frames than it declares: it is damaged")
         frames[count] = part
         count += 1
     if frames is None or count < len(frames):
-        raise InputError(
-            f"{recording.path} declares {recording.frames} frames but holds {count}: it is cut short"
-        )
+        raise InputError(f"{recording.path} declares {wanted} frames but holds {count}: it is cut short")
     return frames

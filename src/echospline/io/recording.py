@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from echospline.errors import EchosplineError, InputError
 from echospline.scene import Floats, Pixels
@@ -79,6 +80,16 @@ class Recording:
         Whether the file is a still image (then one frame is read as an image, not as a cine).
     notes : tuple of str
         Conclusions and doubts of the reader, one sentence each.
+    aspect : float, optional
+        Width over height of a pixel, where the file says it.
+    untimed : str
+        Why the file's own times were of no use; empty where it has none or they were.
+    valid : ndarray, shape (frames,), bool, optional
+        Frames that the file calls good; all of them when None.
+    volume : bool
+        Whether the third axis is a direction in space, so that "frames" are slices.
+    window : (low, high), optional
+        Values that the file asks to be shown as black and white.
     """
 
     path: Path
@@ -95,6 +106,21 @@ class Recording:
     times: Floats | None = None
     single: bool = False
     notes: tuple[str, ...] = ()
+    aspect: float | None = None
+    untimed: str = ""
+    valid: NDArray[np.bool_] | None = None
+    volume: bool = False
+    window: tuple[float, float] | None = None
+
+    @property
+    def decoded_mib(self) -> float:
+        """MiB of all decoded frames together."""
+        return self.rows * self.columns * self.channels * self.dtype.itemsize * self.frames / MIB
+
+    @property
+    def kept(self) -> NDArray[np.intp]:
+        """Numbers of the good frames, ascending."""
+        return np.arange(self.frames) if self.valid is None else np.flatnonzero(self.valid)
 
     def spacing_of(self, box: Box) -> tuple[float, float] | None:
         """Return the spacing in mm of the region that holds a box's centre; the file's own outside of all."""

@@ -91,8 +91,10 @@ class Sequence:
         for name, matrices in self.transforms.items():
             good = matrices[np.isfinite(matrices).all(axis=(1, 2))]
             if frames_of(name)[0] == IMAGE and len(good):
-                lateral, depth = np.linalg.norm(good[0, :3, :2], axis=0)
-                return float(lateral), float(depth)
+                lateral, depth = (float(h) for h in np.linalg.norm(good[0, :3, :2], axis=0))
+                # the identity is the value of a transform that was never calibrated
+                if (lateral, depth) != (1.0, 1.0):
+                    return lateral, depth
         return None
 
     def cine(self, spacing: tuple[float, float] | None = None) -> Cine:

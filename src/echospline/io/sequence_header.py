@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echospline.errors import InputError
+from echospline.io.frame_fields import FRAME_FIELD, FrameFields
 from echospline.scene import Floats, Pixels, frames_of
 
 META_TYPES = {
@@ -31,7 +32,6 @@ MAX_HEADER = 64 * 2**20
 """Bytes; a recording of half an hour at 30 frames per second with four tools has about 40 MiB of header."""
 MAX_LINE = 2**16
 MAX_FRAMES = 10**6
-_FRAME_FIELD = re.compile(r"Seq_Frame(\d{1,7})_(\w+)")
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def read_header(file: IO[bytes], path: Path) -> Header:
     nrrd = file.read(4) == b"NRRD"
     file.seek(0)
     fields = _nrrd_fields(file, path) if nrrd else _meta_fields(file, path)
-    frame_fields = {k: v for k, v in fields.items() if _FRAME_FIELD.fullmatch(k)}
+    frame_fields = {k: v for k, v in fields.items() if FRAME_FIELD.fullmatch(k)}
     top = {k: v for k, v in fields.items() if k not in frame_fields}
     try:
         form = _nrrd_form(top) if nrrd else _meta_form(top)
@@ -105,10 +105,13 @@ def read_header(file: IO[bytes], path: Path) -> Header:
     times, transforms, valid = _frames(frame_fields, count, path)
     if nrrd and np.isnan(times).all():
         times = _index_values(top, count)
-    if np.isnan(times).any():
+    if (missing := np.isnan(times) & valid).any():
         raise InputError(
-            f"{path} has no time stamp for frame {int(np.argmax(np.isnan(times)))} (Seq_Frame..._Timestamp)"
+            f"{path} has no time stamp for frame {int(np.argmax(missing))} (Seq_Frame..._Timestamp)"
         )
+    if form["spacing"] is None:  # the frames' own, where PLUS's 1 1 stands in the header
+        own = [f.spacing for f in FrameFields(frame_fields, count).lengths() if not f.shown]
+        form["spacing"] = _known_spacing(list(own[0])) if own else None
     return Header(
         **form, times=times, transforms=transforms, valid=valid,
         flip_columns=orientation[0] == "U", flip_rows=orientation[1] == "N", other=top,
@@ -223,7 +226,7 @@ def _frames(
     transforms: dict[str, Floats] = {}
     lost: list[tuple[str, int]] = []
     for key, value in fields.items():
-        match = _FRAME_FIELD.fullmatch(key)
+        match = FRAME_FIELD.fullmatch(key)
         assert match is not None  # the caller has chosen these types
         frame, name = int(match[1]), match[2]
         if frame >= count:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +12,10 @@ import av
 import numpy as np
 
 from echospline.errors import InputError
+from echospline.io.declared import Clock, Declared, Lengths, Turn, followed
 from echospline.io.recording import Recording, check_size, decoding
 from echospline.io.tag import tagged_spacing
-from echospline.scene import Floats, Pixels
+from echospline.scene import Pixels
 
 _DEMUXERS = {"MP4": "mov", "QuickTime": "mov", "AVI": "avi", "Matroska": "matroska", "WebM": "matroska"}
 """The one demuxer tried for each format: others of FFmpeg's follow references to other files."""
@@ -48,11 +51,25 @@ def open_video(path: Path, format: str, limit: float) -> Recording:
         grey = str(codec.pix_fmt or "").startswith("gray")
         deep = bool(codec.format and any(c.bits > 8 for c in codec.format.components))
         check_size(path, rows, columns, max(1, int(stream.frames)), 1, limit)
-        times, packets = _timed(container, stream)
+        stamps = [
+            None if packet.pts is None else float(packet.pts * packet.time_base)
+            for packet in container.demux(stream)
+            if packet.size and not packet.is_discard
+        ]
+        packets = len(stamps)
         if packets < int(stream.frames) or packets == 0:
             raise InputError(f"{path} declares {stream.frames} frames but holds {packets}: it is cut short")
         check_size(path, rows, columns, packets, 1, limit)
-        spacing = tagged_spacing(container.metadata.get("comment"))
+        own = tagged_spacing(container.metadata.get("comment"))
+        times, notes = _clock(stamps, stream)
+        said = Declared(
+            aspect=float(stream.sample_aspect_ratio) if stream.sample_aspect_ratio else None,
+            lengths=(Lengths(own, "echospline's comment", shown=True),) if own else (),
+            clocks=times,
+        )
+        said = _turned(said, path, format, notes)
+        if (streams := len(container.streams.video)) > 1:
+            notes.append(f"{streams} video streams: the first taken")
 
     def decode(frame: int | None, colour: bool) -> Iterator[Pixels]:
         count = 0
@@ -73,28 +90,58 @@ def open_video(path: Path, format: str, limit: float) -> Recording:
                     f"{path} holds {packets} frames but only {count} can be decoded: it is damaged"
                 )
 
-    notes = ["more than 8 bits per pixel, read as 8"] if deep else []
-    return Recording(
+    if deep:
+        notes.append("more than 8 bits per pixel, read as 8")
+    stored = Recording(
         path, f"{format}, {name}", rows, columns, packets, 1 if grey else 3, np.dtype(np.uint8), decode,
-        spacing=spacing, times=times, notes=tuple(notes),
+        notes=tuple(notes),
     )  # fmt: skip
+    return followed(stored, said)
 
 
 def _opened(path: Path, format: str) -> Any:
     return av.open(str(path), format=_DEMUXERS[format], **_LENIENT)
 
 
-def _timed(container: Any, stream: Any) -> tuple[Floats | None, int]:
-    """Return the times of the frames in s since the first, from their packets, and how many packets are shown."""
-    stamps: list[float | None] = [
-        None if packet.pts is None else float(packet.pts * packet.time_base)
-        for packet in container.demux(stream)
-        if packet.size and not packet.is_discard
-    ]
-    known = sorted(stamp for stamp in stamps if stamp is not None)
-    if len(known) == len(stamps) > 0:
-        times: Floats = np.array(known) - known[0]
-        return times, len(stamps)
+def _clock(stamps: list[float | None], stream: Any) -> tuple[tuple[Clock, ...], list[str]]:
+    """Return the packets' time stamps in order of display, else the stream's rate."""
     rate = stream.average_rate or stream.guessed_rate
-    even: Floats | None = np.arange(len(stamps), dtype=np.float64) / float(rate) if rate else None
-    return even, len(stamps)
+    even = Clock("the stream's rate", np.arange(len(stamps)) / float(rate)) if rate else None
+    if None not in stamps:
+        shown = Clock("its time stamps", np.sort(np.array(stamps, dtype=np.float64)))
+        # the rate is derived from the stamps or nominal: a second source only where they fail
+        return (shown,) if even is None or _runs(shown) else (shown, even), []
+    missing = f"lack that of packet {stamps.index(None)}"
+    return (Clock("its time stamps", None, missing), *((even,) if even else ())), []
+
+
+def _runs(clock: Clock) -> bool:
+    return clock.seconds is not None and len(clock.seconds) > 0 and bool(np.ptp(clock.seconds) > 0)
+
+
+def _turned(said: Declared, path: Path, format: str, notes: list[str]) -> Declared:
+    """Follow the display matrix, which FFmpeg hands over with the first decoded frame; note fields of interlaced video."""
+    try:
+        with _opened(path, format) as container:
+            picture = next(container.decode(video=0), None)
+            matrix = None if picture is None else _display_matrix(picture)
+            if picture is not None and picture.interlaced_frame:
+                notes.append("interlaced: rows of two moments are in one frame")
+    except (av.FFmpegError, OSError):  # a damaged first frame is reported when it is decoded for use
+        return said
+    if matrix is None:
+        return said
+    turn = Turn.of_matrix(*matrix)
+    if turn is None:
+        notes.append("its display matrix turns by no multiple of 90 degrees: not followed")
+        return said
+    return replace(said, turn=turn, turned_by="its display matrix")
+
+
+def _display_matrix(picture: Any) -> tuple[float, float, float, float] | None:
+    """Return (a, b, c, d) of the nine 16.16 numbers a b u, c d v, x y w."""
+    for data in picture.side_data.keys():  # noqa: SIM118 - its iteration gives no entries
+        if getattr(data.type, "name", "") == "DISPLAYMATRIX":
+            a, b, _, c, d = struct.unpack_from("=5i", bytes(data))
+            return a / 65536, b / 65536, c / 65536, d / 65536
+    return None

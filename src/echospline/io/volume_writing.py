@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from echospline.atomic import give_name, part_of, writing
+from echospline.atomic import appearing
 from echospline.errors import InputError
 from echospline.io.metaimage import ELEMENT_TYPES
 from echospline.scene import Volume
@@ -51,11 +51,8 @@ def write_volume(path: str | Path, volume: Volume) -> Path:
         f"ElementType = {ELEMENT_TYPES[voxels.dtype.name]}",
         "ElementDataFile = LOCAL",
     ]
-    part = part_of(path)
-    with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with appearing(path) as part:
         part.write_bytes(("\n".join(lines) + "\n").encode("ascii") + data)
-        give_name(part, path)
     return path
 
 

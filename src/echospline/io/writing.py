@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from math import isfinite
 from pathlib import Path
@@ -13,9 +13,24 @@ import numpy as np
 
 from echospline.atomic import give_name, part_of, writing
 from echospline.errors import InputError
-from echospline.scene import Pixels, RegularGrid, is_number
+from echospline.scene import Pixels, RegularGrid, is_number, shades
 
 FORMATS = (".mp4", ".gif", ".mha")
+
+
+TRANSPARENT = ("png", "mha")
+"""Formats of `output.formats` that hold opacity."""
+
+
+def needs_window(formats: Iterable[str], dtype: np.dtype[np.generic], *, transparent: bool = False) -> bool:
+    """Test whether a format of `output.formats` cannot hold pixels of a type, so that they need a window.
+
+    MP4 and GIF hold 8 bits, PNG 8 and 16 (8 with opacity), the others any type.
+    """
+    if dtype == np.dtype(np.uint8):
+        return False
+    deep = dtype == np.dtype(np.uint16) and not transparent
+    return any(name in ("mp4", "gif") or (name == "png" and not deep) for name in formats)
 
 
 class Encoder(Protocol):
@@ -45,26 +60,31 @@ class CineWriter:
     grid : RegularGrid
         Pixel centres of every frame, mm.
     encoder : callable
-        ``encoder(part, grid, colour, dtype)`` opens the temporary file.
+        ``encoder(part, grid, channels, dtype)`` opens the temporary file.
     types : tuple of dtype
         Pixel types the format holds; empty for any.
     window : (low, high), optional
         Pixel values shown as black and white, for pixels of other types.
+    transparent : bool
+        Whether the format holds a fourth channel, opacity.
     """
 
     def __init__(
         self,
         path: Path,
         grid: RegularGrid,
-        encoder: Callable[[Path, RegularGrid, bool, np.dtype[np.generic]], Encoder],
+        encoder: Callable[[Path, RegularGrid, int, np.dtype[np.generic]], Encoder],
         types: tuple[np.dtype[np.generic], ...] = (),
         window: tuple[float, float] | None = None,
+        *,
+        transparent: bool = False,
     ) -> None:
         self.path = path
         self.grid = grid
         self.count = 0
         self._open, self._types, self._window = encoder, types, window
         self._part = part_of(path)
+        self._channels = (3, 4) if transparent else (3,)
         self._encoder: Encoder | None = None
         self._last = -np.inf
         self._form: tuple[tuple[int, ...], np.dtype[np.generic]] | None = None
@@ -76,7 +96,7 @@ class CineWriter:
         Parameters
         ----------
         pixels : ndarray, shape (rows, columns) or (rows, columns, 3)
-            Grey or RGB, of one shape and type for all frames.
+            Grey or RGB (RGBA in `TRANSPARENT` formats), of one shape and type for all frames.
         time : float
             s; later than the frame before.
 
@@ -90,12 +110,9 @@ class CineWriter:
         pixels = np.asarray(pixels)
         form = (pixels.shape, pixels.dtype)
         rows_columns = (self.grid.shape[1], self.grid.shape[0])
-        if pixels.shape not in (rows_columns, (*rows_columns, 3)) or self._form not in (None, form):
-            expected = (
-                f"{self._form[0]} {self._form[1]}"
-                if self._form
-                else f"{rows_columns} or {(*rows_columns, 3)}"
-            )
+        shapes = (rows_columns, *((*rows_columns, n) for n in self._channels))
+        if pixels.shape not in shapes or self._form not in (None, form):
+            expected = f"{self._form[0]} {self._form[1]}" if self._form else " or ".join(map(str, shapes))
             raise InputError(
                 f"a frame of {self.path.name} must be {expected}; got {pixels.shape} {pixels.dtype}"
             )
@@ -108,7 +125,9 @@ class CineWriter:
             self._form = form
             with writing(self.path):
                 self.path.parent.mkdir(parents=True, exist_ok=True)
-                self._encoder = self._open(self._part, self.grid, pixels.ndim == 3, pixels.dtype)
+                self._encoder = self._open(
+                    self._part, self.grid, pixels.shape[2] if pixels.ndim == 3 else 1, pixels.dtype
+                )
         with writing(self.path):
             self._encoder.add(pixels, float(time))
         self._last = float(time)
@@ -154,11 +173,7 @@ class CineWriter:
                 f"{self.path.name} holds pixels of {', '.join(str(t) for t in self._types)}; got {pixels.dtype}: "
                 "give window=(low, high), the values shown as black and white"
             )
-        low, high = self._window
-        shade = np.rint((pixels.astype(np.float64) - low) * (255.0 / (high - low)))
-        if not np.isfinite(shade).all():
-            raise InputError(f"a frame of {self.path.name} holds values that are not finite")
-        return np.clip(shade, 0, 255).astype(np.uint8)
+        return shades(pixels, *self._window)
 
 
 def open_writer(
@@ -195,20 +210,27 @@ def open_writer(
     if suffix == ".mp4":
         from echospline.io.mp4 import Mp4Encoder  # noqa: PLC0415
 
-        return CineWriter(path, grid, lambda p, g, c, t: Mp4Encoder(p, g, c, fps), (byte,), window)
+        return CineWriter(path, grid, lambda p, g, c, t: Mp4Encoder(p, g, c > 1, fps), (byte,), window)
     if suffix == ".gif":
         from echospline.io.gif import GifEncoder  # noqa: PLC0415
 
-        return CineWriter(path, grid, lambda p, g, c, t: GifEncoder(p, g, c, fps), (byte,), window)
+        return CineWriter(path, grid, lambda p, g, c, t: GifEncoder(p, g, c > 1, fps), (byte,), window)
     if suffix == ".mha":
         from echospline.io.metaimage import MetaImageEncoder  # noqa: PLC0415
 
-        return CineWriter(path, grid, lambda p, g, c, t: MetaImageEncoder(p, g, c, t, fps), (), window)
+        return CineWriter(
+            path, grid, lambda p, g, c, t: MetaImageEncoder(p, g, c, t, fps), (), window, transparent=True
+        )
     if suffix == "":
         from echospline.io.frames import FramesEncoder  # noqa: PLC0415
 
         return CineWriter(
-            path, grid, lambda p, g, c, t: FramesEncoder(p, g, path), (byte, np.dtype(np.uint16)), window
+            path,
+            grid,
+            lambda p, g, c, t: FramesEncoder(p, g, path),
+            (byte, np.dtype(np.uint16)),
+            window,
+            transparent=True,
         )
     raise InputError(
         f"a cine is written as {', '.join(FORMATS)} or to a folder of PNG files (no suffix); got {path.name!r}"

@@ -6,27 +6,42 @@ from echospline.menu import on_demand
 
 if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.laboratory.acoustic import channel_data
-    from echospline.laboratory.beamform import LinearArray, delay_and_sum
+    from echospline.laboratory.beamform import LinearArray, delay_and_sum, demodulate
+    from echospline.laboratory.kidney import Kidney, kidney
+    from echospline.laboratory.kidney_recipe import LabelledTissue, TissueKind
     from echospline.laboratory.needle_field import NeedleField
     from echospline.laboratory.phantom import Displacement, Inclusion, Layer, Phantom, Scatterers
     from echospline.laboratory.phantom_cine import displacement_of, phantom_pictures
     from echospline.laboratory.rescatter import rescatter
+    from echospline.laboratory.sample_volumes import SAMPLE_VOLUMES, sample_volume
+    from echospline.laboratory.sonogram import ABDOMINAL, Faces, Scattering, SpatialPhantom
     from echospline.laboratory.speckle import speckle_statistics
 else:
     on_demand(__name__)
 
 __all__ = [
+    "ABDOMINAL",
+    "SAMPLE_VOLUMES",
     "Displacement",
+    "Faces",
     "Inclusion",
+    "Kidney",
+    "LabelledTissue",
     "Layer",
     "LinearArray",
     "NeedleField",
     "Phantom",
     "Scatterers",
+    "Scattering",
+    "SpatialPhantom",
+    "TissueKind",
     "channel_data",
     "delay_and_sum",
+    "demodulate",
     "displacement_of",
+    "kidney",
     "phantom_pictures",
     "rescatter",
+    "sample_volume",
     "speckle_statistics",
 ]

@@ -21,7 +21,6 @@ from math import pi
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from echospline.errors import InputError
 from echospline.scene import Floats, Tissue
@@ -250,7 +249,7 @@ class HalfPlane:
         a, e2 = 3.0 - 4.0 * self.nu, radius * radius
         b = -1.0 if self.top == "free" else a
         n = (normals[:, 0] + 1j * normals[:, 1])[:, None]
-        w: NDArray[np.complex128] = 1.0 / (dx + 1j * (y + c)).astype(np.complex128)
+        w = np.reciprocal((dx + 1j * (y + c)).astype(np.complex128))
         T = np.empty((len(normals), 2, dx.shape[1], 2))
         for j, F in enumerate((1.0, 1j)):
             G = complex(F).conjugate()

@@ -21,10 +21,10 @@ CALM = 2.5
 """A step moves no node further than this times the needle's travel and the relaxation due, but where friction is at once."""
 
 SUBSTEP = 0.25
-"""mm of the needle's travel after which a step looks again at who touches it: longer ones would depend on the time step."""
+"""mm of the needle's travel after which a step looks again at who touches it, where friction has no reach: see `longest_substep`."""
 
 MOST_SUBSTEPS = 100
-"""In one step; a needle that moves further than this many times `SUBSTEP` at once has been put elsewhere, not moved."""
+"""In one step; a needle that moves further than this many substeps at once has been put elsewhere, not moved."""
 
 
 class Pose(Protocol):
@@ -93,6 +93,14 @@ def relax(q: Floats, target: Floats, alpha3: float, dt: float) -> Floats:
     """
     relaxed: Floats = target + (q - target) * exp(-alpha3 * dt)
     return relaxed
+
+
+def longest_substep(delta: float) -> float:
+    """Travel (mm) after which a step looks again at who touches the needle: a sixth of friction's reach delta (mm).
+
+    Longer ones would depend on the time step; and a scene in another unit of length is divided as this one is.
+    """
+    return delta / 6.0 if delta > 0 else SUBSTEP
 
 
 def approach(q: Floats, target: Floats, travel: Floats | float) -> Floats:

@@ -13,12 +13,12 @@ from echospline.mechanics.interaction import (
     CALM,
     LET_GO,
     MOST_SUBSTEPS,
-    SUBSTEP,
     Pose,
     approach,
     friction,
     largest_share,
     load,
+    longest_substep,
     needle_travel,
     relax,
     stick,
@@ -147,7 +147,13 @@ class Reference:
         before = _at(pose.entry, pose.entry) if state.pose is None else state.pose
         parts = 1
         if self.parameters.loading != "immediate":
-            parts = max(1, min(MOST_SUBSTEPS, ceil(needle_travel(before, pose) / SUBSTEP - 1e-9)))
+            parts = max(
+                1,
+                min(
+                    MOST_SUBSTEPS,
+                    ceil(needle_travel(before, pose) / longest_substep(self.parameters.delta) - 1e-9),
+                ),
+            )
         held_back = state.held_back
         for part in range(1, parts + 1):
             there = pose if part == parts else _between(before, pose, part / parts)

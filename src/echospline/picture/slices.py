@@ -238,6 +238,14 @@ def gradients(points: Floats, field: Field, h: float = 1e-2) -> Floats:
     return gradient
 
 
+def lattice_of(probe: Probe) -> RegularGrid:
+    """Return the lattice of a probe's pixels on which origins are found: every `STEP`-th, to the last one or beyond."""
+    columns, rows = probe.grid.shape
+    dx, dy = probe.grid.spacing
+    shape = (ceil((columns - 1) / STEP) + 1, ceil((rows - 1) / STEP) + 1)
+    return RegularGrid(shape, (STEP * dx, STEP * dy), probe.grid.origin)
+
+
 class SliceDrawing:
     """Draws pictures of a probe in a volume.
 
@@ -254,11 +262,7 @@ class SliceDrawing:
         self._voxels = NativeVolume(volume)
         grid = probe.grid
         columns, rows = grid.shape
-        self._lattice = RegularGrid(
-            (ceil((columns - 1) / STEP) + 1, ceil((rows - 1) / STEP) + 1),
-            (STEP * grid.spacing[0], STEP * grid.spacing[1]),
-            grid.origin,
-        )
+        self._lattice = lattice_of(probe)
         self._spread = probe.thickness(grid.y) if probe.elevation > 0 else None
         span = ((columns - 1) * grid.spacing[0], (rows - 1) * grid.spacing[1])
         blank: Pixels = np.zeros((rows, columns), np.uint8)

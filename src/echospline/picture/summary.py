@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -24,6 +25,7 @@ _DATE = {"svg": "Date", "pdf": "CreationDate"}
 _MOST_LINES = 41
 """Mesh lines drawn each way; of a finer mesh every k-th line is shown, and the figure says so."""
 _MOST_ARROWS = 18
+_MOST_CELLS = 20_000_000
 _MOVED = 1e-6
 """mm; below this nothing is called displaced."""
 
@@ -175,17 +177,7 @@ def tracking_figure(
         ),
         (trust, confidence, "confidence", "viridis", 0.0, 1.0),
     ):
-        drawn = axes.scatter(
-            points[:, 0],
-            points[:, 1],
-            c=values,
-            s=6,
-            marker="s",
-            cmap=colours,
-            vmin=low,
-            vmax=high,
-            linewidths=0,
-        )
+        drawn = _draw_cells(axes, points, values, colours, (low, high))
         figure.colorbar(drawn, ax=axes, label=name)
         axes.set(aspect="equal", title=name.split(",", maxsplit=1)[0].capitalize(), xlabel="lateral, mm")
     if pose is not None and pose.depth > 0:
@@ -194,6 +186,28 @@ def tracking_figure(
     arrows.set_xlim(left, right)
     arrows.set_ylim(bottom, top)
     save(figure, path)
+
+
+def _draw_cells(axes: Axes, points: Floats, values: Floats, colours: str, limits: tuple[float, float]) -> Any:
+    """Colour the cell around every point, cell touching cell; points that are on no lattice become dots."""
+    low, high = limits
+    sides = [np.unique(np.round(points[:, i], 9)) for i in (0, 1)]
+    pitch = [float(np.diff(side).min()) if len(side) > 1 else 1.0 for side in sides]
+    origin = np.array([side[0] for side in sides])
+    index = np.rint((points - origin) / pitch).astype(int)
+    columns, rows = index.max(axis=0) + 1
+    off = np.abs(points - origin - index * pitch).max(initial=0.0)
+    if off > 0.05 * min(pitch) or columns * rows > _MOST_CELLS:
+        return axes.scatter(
+            points[:, 0], points[:, 1], c=values, s=6, marker="s", cmap=colours, vmin=low, vmax=high, linewidths=0
+        )  # fmt: skip
+    cells = np.full((rows, columns), np.nan)
+    cells[index[:, 1], index[:, 0]] = values
+    (x0, y0), (dx, dy) = origin, pitch
+    return axes.imshow(
+        cells, cmap=colours, vmin=low, vmax=high, interpolation="nearest",
+        extent=(x0 - dx / 2, x0 + (columns - 0.5) * dx, y0 + (rows - 0.5) * dy, y0 - dy / 2),
+    )  # fmt: skip
 
 
 def _spread(points: Floats, step: float) -> NDArray[np.intp]:

@@ -10,14 +10,13 @@ if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.scenario.scale import (
         PHANTOM,
         check,
-        check_points,
         check_store,
         needle_doubts,
-        prepared,
         size_doubts,
     )
     from echospline.scenario.scenario import LARGEST_FILE, Scenario, describe, load, validated
     from echospline.scenario.sections import DiscSection, ExerciseSection
+    from echospline.scenario.space_scene import is_spatial, open_spatial
 else:
     on_demand(__name__)
 
@@ -30,12 +29,12 @@ __all__ = [
     "Scenario",
     "build_model",
     "check",
-    "check_points",
     "check_store",
     "describe",
+    "is_spatial",
     "load",
     "needle_doubts",
-    "prepared",
+    "open_spatial",
     "run",
     "size_doubts",
     "validated",

@@ -68,21 +68,13 @@ def _forces(load: NeedleLoad | None) -> dict[str, float]:
 
 
 def _sink(
-    name: str,
-    stack: ExitStack,
-    out: Path,
-    image: UltrasoundImage,
-    fps: float,
-    window: tuple[float, float] | None,
+    name: str, stack: ExitStack, out: Path, image: UltrasoundImage, fps: float
 ) -> Callable[[Frame], None]:
     """Open the writer of one format."""
     if name in ("igs.mha", "seq.nrrd"):  # for PLUS and 3D Slicer: pictures with the needle's transforms
         recording = stack.enter_context(SequenceWriter(out / SUFFIX[name], image.grid))
         return lambda frame: recording.add(frame.image.pixels, frame.time, frame.pose)
-    narrow = name != "mha" and (window is not None)
-    cine = stack.enter_context(
-        open_writer(out / SUFFIX[name], image.grid, fps, window=window if narrow else None)
-    )
+    cine = stack.enter_context(open_writer(out / SUFFIX[name], image.grid, fps))
     return lambda frame: cine.add(frame.image.pixels, frame.time)
 
 
@@ -116,7 +108,7 @@ def run(
     form_image : callable, optional
         See `simulate`.
     doubts : sequence of str
-        What was said before the run (see `prepared`); kept in the report.
+        What was said before the run (see `check`); kept in the report.
 
     Returns
     -------
@@ -141,7 +133,7 @@ def run(
         sinks = []
         for name in dict.fromkeys(output.formats):
             files.append(SUFFIX[name])
-            sinks.append(_sink(name, stack, out, image, output.fps, output.window))
+            sinks.append(_sink(name, stack, out, image, output.fps))
         record = None
         if output.displacement:
             files.append("displacement.npz")
@@ -193,6 +185,7 @@ def run(
             "source": image.source,
             "pixels": list(image.pixels.shape),
             "spacing_mm": list(image.spacing),
+            "notes": list(image.notes),
         },
         "model": scenario.model.kind,
         "mesh_nodes": model.grid.size,
@@ -212,7 +205,11 @@ def run(
         },
         "seconds": perf_counter() - began,
         "files": [*files, "scenario.toml", "run.json"],
-        "versions": {"python": platform.python_version(), "platform": platform.platform(), **_versions()},
+        "versions": {
+            "python": platform.python_version(),
+            "platform": platform.platform(),
+            **package_versions(),
+        },
         "core": describe_core(),
         "parameters": scenario.model_dump(mode="json"),
     }
@@ -221,7 +218,8 @@ def run(
     return report
 
 
-def _versions() -> dict[str, str]:
+def package_versions() -> dict[str, str]:
+    """Return the versions of the packages that a report names."""
     found = {}
     for name in REPORTED_PACKAGES:
         try:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from math import atan2, ceil, degrees, hypot, inf, isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -39,8 +39,6 @@ MOST_FRAMES, MOST_STEPS = 1_000_000, 100_000_000
 LONG_SECONDS, LONG_BYTES = 60.0, 2**30
 """A run that takes longer or writes more says so before it starts."""
 GIB = 2**30
-MOST_POINTS = 1_000_000
-"""Tracked points: one per pixel of a large picture."""
 
 _UNITS: Mapping[str, float] = {"micrometres": 1e-3, "metres": 1e3, "centimetres": 10.0}
 """Units that are typed in place of mm, and what one of them in mm is over what was meant."""
@@ -53,8 +51,6 @@ _SHARE: Mapping[str, float] = {
     "seq.nrrd": 2.0,
 }
 """Bytes on the disk per byte of pixels: measured on B-mode; raw formats are laid out once more when they are completed."""
-_HELD: Mapping[str, tuple[Any, ...]] = {"mp4": (np.uint8,), "gif": (np.uint8,), "png": (np.uint8, np.uint16)}
-"""Types of pixels of the formats that do not hold all."""
 _FEM_BYTES = 6_500
 """Memory of finite elements per node: measured from 10 000 to 160 000 nodes, factor and assembly."""
 _STEP, _FEM_STEP = 7e-4, 1e-6
@@ -255,59 +251,6 @@ def check_store(samples: int, bytes_each: int, out: Path) -> list[str]:
             f"{samples:,} samples of {_sized(bytes_each)} are {_sized(size)}; in {out} {_sized(free)} are free: choose a smaller --n"
         )
     return [f"{samples:,} samples, up to {_sized(size)} on the disk"] if size > LONG_BYTES else []
-
-
-def prepared(
-    scenario: Scenario, image: UltrasoundImage, out: Path | None = None
-) -> tuple[Scenario, list[str]]:
-    """Check the scale of a run (see `check`) and choose the window of pixels that a format cannot hold.
-
-    Returns
-    -------
-    scenario : Scenario
-        With ``output.window`` where one is needed.
-    doubts : list of str
-        One sentence each.
-    """
-    doubts = check(scenario, image, out)
-    dtype = image.pixels.dtype
-    narrow = [name for name in scenario.output.formats if dtype not in _HELD.get(name, (dtype,))]
-    if narrow and scenario.output.window is None:
-        low, high = window_of(image)
-        scenario = scenario.with_values({"output.window": [low, high]})
-        doubts.append(
-            f"pixels are {dtype}: in {', '.join(narrow)}, {low:g} is shown as black and {high:g} as white "
-            "(output.window, --window)"
-        )
-    return scenario, doubts
-
-
-def check_points(grid: RegularGrid, distance: float, frames: int, key: str) -> None:
-    """Check the number of tracked points before they are laid out.
-
-    Raises
-    ------
-    InputError
-        If they are too many for their distance to be meant, or for the memory.
-    """
-    x0, x1, y0, y1 = grid.extent
-    count = (x1 - x0) * (y1 - y0) / distance**2 if distance > 0 else inf
-    if count > MOST_POINTS or count * frames * 64 > _memory():
-        raise InputError(
-            f"{key} = {distance:g} mm between points over {x1 - x0:.4g} x {y1 - y0:.4g} mm are {count:,.0f} points in {frames} frames; "
-            f"expected {MOST_POINTS:,} points at most, and {_sized(count * frames * 64)} of memory: choose a larger distance in mm"
-        )
-
-
-def window_of(image: UltrasoundImage) -> tuple[float, float]:
-    """Choose the pixel values shown as black and white where a format holds 8 bits.
-
-    From 0, or the least value where that is negative, to the largest: nothing is cut.
-    """
-    pixels: Any = image.pixels[..., :3] if image.pixels.ndim == 3 else image.pixels
-    finite = pixels[np.isfinite(pixels)]
-    low, high = min(0.0, float(finite.min(initial=0.0))), float(finite.max(initial=0.0))
-    return low, high if high > low else low + 1.0
 
 
 def _inside(entry: Floats, tip: Floats, grid: RegularGrid) -> float:

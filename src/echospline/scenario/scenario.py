@@ -33,6 +33,7 @@ from echospline.scenario.sections import (
     Section,
     TissueSection,
 )
+from echospline.scenario.space_section import SpaceSection
 from echospline.scene import (
     Circle,
     Insertion,
@@ -73,6 +74,7 @@ class Scenario(Section):
     output: OutputSection = Field(default_factory=OutputSection)
     probe: ProbeSection = Field(default_factory=ProbeSection)
     phantom: PhantomSection = Field(default_factory=PhantomSection)
+    space: SpaceSection | None = Field(None, description="a scene in space: the image is a volume")
     exercise: list[ExerciseSection] = Field(default=[], description="what can be trained live")
 
     @model_validator(mode="before")
@@ -106,6 +108,8 @@ class Scenario(Section):
             *tables, last = key.split(".")
             table = tree
             for name in tables:
+                if table.get(name, 0) is None:  # a table that is not there yet: [space]
+                    table[name] = {}
                 table = table[name]
             table[last] = value
         mesh = tree["mesh"]
@@ -124,22 +128,64 @@ class Scenario(Section):
         return validated(tree, origin)
 
     def read_image(self, folder: Path) -> UltrasoundImage:
-        """Read the image; a relative path starts at ``folder``; sample:phantom is [phantom] at rest.
+        """Read the image; a relative path starts at ``folder``; sample:phantom is [phantom] at rest."""
+        return self.opened(folder)[1]
+
+    def opened(self, folder: Path, *, eight_bit: bool | None = False) -> tuple[Scenario, UltrasoundImage]:
+        """Read the image, and write the choices that its file left open into the scenario: frame and window.
+
+        Parameters
+        ----------
+        folder : Path
+            Start of relative paths.
+        eight_bit : bool, optional
+            Whether pixels of other types need a window; None where the formats decide. The window chosen is the file's
+            own (DICOM, NIfTI), else the lowest and highest value of the picture, which loses no contrast to the ends.
+
+        Returns
+        -------
+        scenario : Scenario
+            Running it again gives the same image.
+        image : UltrasoundImage
+            Its notes are the reader's and those of the window.
 
         Raises
         ------
         InputError
-            If it cannot be read, or has a size that no ultrasound picture has.
+            If the file cannot be read, is a volume and no slice is named, or has a size that no ultrasound picture has.
         """
         section = self.image
         if section.file == PHANTOM:
-            return self.phantom.still(self.probe.probe())
-        from echospline.io import read_image  # noqa: PLC0415  (a wrong key is said before readers are loaded)
+            image = self.phantom.still(self.probe.probe())
+            return self, image if section.window is None else image.windowed(*section.window)
+        if not section.file.strip():
+            raise InputError("image.file is empty; expected an image, a cine or sample:calf")
+        from echospline.io import choose_image, needs_window  # noqa: PLC0415  (a wrong key is said before readers are loaded)
 
         name = section.file if section.file.startswith("sample:") else str(folder / section.file)
-        image = read_image(name, spacing=section.spacing, frame=section.frame, region=section.region)
+        image, frame, asked = choose_image(
+            name, spacing=section.spacing, frame=section.frame, region=section.region
+        )
         size_doubts(image.grid)  # refuses what no scene can be, before anything is made of it
-        return image
+        if eight_bit is None:
+            clear = self.output.border == "transparent"
+            eight_bit = needs_window(self.output.formats, image.pixels.dtype, transparent=clear)
+        window = section.window
+        if window is None and eight_bit and image.pixels.dtype != np.uint8:
+            window = asked or _span(image)
+        if window is not None:
+            image = image.windowed(*window)
+        chosen = section.model_copy(
+            update={"window": window, "frame": frame if frame or section.frame is not None else None}
+        )
+        return self.model_copy(update={"image": chosen}), image
+
+    def label_notes(self, folder: Path) -> list[str]:
+        """List the notes of the readers on the labels images of the tissue."""
+        from echospline.io import open_recording  # noqa: PLC0415  (as above)
+
+        files = dict.fromkeys(r.labels.file for r in self.tissue.region if r.labels is not None)
+        return [f"{file}: {note}" for file in files for note in open_recording(folder / file).notes]
 
     def grid(self, image: UltrasoundImage) -> RegularGrid:
         """Lay the mesh over the image."""
@@ -212,7 +258,7 @@ def load(path: str | Path) -> Scenario:
         size = path.stat().st_size
         if size > LARGEST_FILE:
             raise InputError(f"{path} has {size} bytes; a scenario is a TOML file of at most {LARGEST_FILE}")
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")  # some editors begin a file with a byte-order mark
         tree = tomllib.loads(text)
     except OSError as error:
         raise InputError(f"cannot read the scenario {path}: {error.strerror}") from error
@@ -260,6 +306,15 @@ def _profiled(n: NeedleSection, profile: Sequence[tuple[float, float]]) -> Inser
         times, depths = np.append(times, times[-1] + depths[-1] / back), np.append(depths, 0.0)
     entry = np.array(n.entry)
     return Insertion(times, entry, entry + depths[:, None] * axis)
+
+
+def _span(image: UltrasoundImage) -> tuple[float, float]:
+    """Return the lowest and highest value of a picture, for a window that cuts nothing."""
+    values = image.pixels[np.isfinite(image.pixels)]
+    if values.size == 0:
+        raise InputError("a picture holds no value that is finite")
+    low, high = float(values.min()), float(values.max())
+    return low, high if high > low else low + 1.0
 
 
 def _shape(region: RegionSection, folder: Path, mesh: RegularGrid, key: str) -> Shape:

@@ -59,10 +59,25 @@ class ImageSection(Section):
     spacing: tuple[Annotated[Millimetres, Field(gt=0)], Annotated[Millimetres, Field(gt=0)]] | None = Field(
         None, description="mm per pixel (lateral, depth); only where the file does not say"
     )
-    frame: int = Field(0, ge=0, description="frame of a cine, from 0")
+    frame: int | None = Field(
+        None,
+        ge=0,
+        description="frame of a cine or slice of a volume, from 0; the first good frame of a cine where not given",
+    )
     region: tuple[int, int, int, int] | None = Field(
         None, description="pixels to keep (left, top, right, bottom), the last two just outside"
     )
+    window: tuple[float, float] | None = Field(
+        None,
+        description="pixel values shown as black and white; where not given and needed, the file's own window, else the "
+        "lowest and highest value of the picture",
+    )
+
+    @model_validator(mode="after")
+    def _ascending(self) -> Self:
+        if self.window is not None and not self.window[0] < self.window[1]:
+            raise ValueError(f"window = {list(self.window)}: expected two pixel values, low before high")
+        return self
 
 
 class LabelsSection(Section):
@@ -353,11 +368,7 @@ class OutputSection(Section):
     figure: bool = Field(True, description="write summary.png")
     needle: bool = Field(True, description="draw the needle's echo")
     border: Annotated[float, Field(ge=0)] | Literal["transparent"] = Field(
-        0.0, description="value where no tissue comes to lie"
-    )
-    window: tuple[float, float] | None = Field(
-        None,
-        description="pixel values shown as black and white where a format holds 8 bits; chosen where needed and not given",
+        0.0, description="value where no tissue comes to lie; transparent with the formats png and mha"
     )
     folding: Literal["flag", "refuse"] = Field("flag", description="what happens when the picture folds")
     inverse: Literal["auto", "exact"] = Field(
@@ -367,6 +378,20 @@ class OutputSection(Section):
         "warp",
         description="warp the picture, or move scatterers as bright as it and image them anew ([probe])",
     )
+
+    @model_validator(mode="after")
+    def _holds_opacity(self) -> Self:
+        if self.border != "transparent":
+            return self
+        from echospline.io import TRANSPARENT  # noqa: PLC0415  (a wrong key is said before readers are loaded)
+
+        other = [name for name in self.formats if name not in TRANSPARENT]
+        if other:
+            raise ValueError(
+                f"border = transparent cannot be written as {', '.join(other)}; formats with transparency are "
+                f"{', '.join(TRANSPARENT)}: give --formats {TRANSPARENT[0]}"
+            )
+        return self
 
 
 class DiscSection(Section):

@@ -7,7 +7,7 @@ from echospline.menu import on_demand
 if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.scene.echo import Complexes, Display, Echo, EchoCine, fourier_frequencies
     from echospline.scene.grid import EDGES, Floats, RegularGrid, as_points
-    from echospline.scene.image import Cine, Pixels, UltrasoundImage
+    from echospline.scene.image import Cine, Pixels, UltrasoundImage, shades
     from echospline.scene.imaging_plane import AXIAL, ImagingPlane, Reach, TrackedNeedle, Visible
     from echospline.scene.metrics import MOVED, FieldError, distance, field_error
     from echospline.scene.needle import ZERO_LENGTH, Insertion, NeedlePose
@@ -82,5 +82,6 @@ __all__ = [
     "frames_of",
     "is_number",
     "probe_plane",
+    "shades",
     "transform_between",
 ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,8 @@ class UltrasoundImage:
         Pixel centres in mm; ``grid.shape == (columns, rows)``.
     source : str
         Origin of the picture (file, licence), for reports.
+    notes : tuple of str
+        Conclusions and doubts of its reader, one sentence each.
 
     Raises
     ------
@@ -36,6 +39,7 @@ class UltrasoundImage:
     pixels: Pixels
     grid: RegularGrid
     source: str = ""
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         _check_pixels(self.pixels.shape, self.grid)
@@ -49,6 +53,24 @@ class UltrasoundImage:
                 f"an image has shape (rows, columns) or (rows, columns, 3 or 4); got {pixels.shape}"
             )
         return cls(pixels, RegularGrid((pixels.shape[1], pixels.shape[0]), spacing), source)
+
+    def windowed(self, low: float, high: float) -> UltrasoundImage:
+        """Return the image in 8 bits: ``low`` becomes black, ``high`` white, values outside black or white.
+
+        A note says what was done, and how many pixels lie outside.
+
+        Raises
+        ------
+        InputError
+            If low is not below high.
+        """
+        values: NDArray[Any] = self.pixels[..., :3] if self.pixels.ndim == 3 else self.pixels
+        grey = shades(values, low, high)
+        outside = float(((values < low) | (values > high)).mean())
+        note = f"values {low:g} to {high:g} are shown as black to white in 8 bits"
+        if outside > 0:
+            note += f"; {outside:.2%} of the pixels lie outside and become black or white"
+        return UltrasoundImage(grey, self.grid, f"{self.source}; {note}", (*self.notes, note))
 
     @property
     def spacing(self) -> tuple[float, float]:
@@ -70,6 +92,8 @@ class Cine:
         Pixel centres in mm.
     source : str
         Origin of the recording.
+    notes : tuple of str
+        Conclusions and doubts of its reader, one sentence each.
 
     Raises
     ------
@@ -81,6 +105,7 @@ class Cine:
     times: Floats
     grid: RegularGrid
     source: str = ""
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.frames.ndim not in (3, 4) or len(self.frames) == 0:
@@ -102,7 +127,23 @@ class Cine:
 
     def __getitem__(self, index: int) -> UltrasoundImage:
         """Return one frame as an image."""
-        return UltrasoundImage(self.frames[index], self.grid, self.source)
+        return UltrasoundImage(self.frames[index], self.grid, self.source, self.notes)
+
+
+def shades(pixels: Pixels, low: float, high: float) -> NDArray[np.uint8]:
+    """Convert pixels to 8-bit grey: ``low`` becomes 0, ``high`` 255, values outside 0 or 255.
+
+    Raises
+    ------
+    InputError
+        If low is not below high, or a value is not finite.
+    """
+    if not (np.isfinite([low, high]).all() and low < high):
+        raise InputError(f"window must be two pixel values, low before high; got {(low, high)}")
+    shade = (np.asarray(pixels, dtype=np.float64) - low) * (255.0 / (high - low))
+    if not np.isfinite(shade).all():
+        raise InputError("a picture holds values that are not finite")
+    return np.asarray(np.clip(np.rint(shade), 0, 255), dtype=np.uint8)
 
 
 def _check_pixels(shape: tuple[int, ...], grid: RegularGrid) -> None:

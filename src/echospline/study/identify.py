@@ -239,13 +239,32 @@ class _Problem:
             A = self.fields.fields(dict(theta) | self.guess)[self.seen]
             self.runs += 1
             before = self.guess
-            x = self.linear(A, self.target, objective, tolerance=1e-9 if exact else 1e-4)
+            x = self._below(names, A, objective, 1e-9 if exact else 1e-4)
             self.guess = dict(zip(names, map(float, x), strict=True))
             if all(abs(self.guess[n] - before.get(n, np.inf)) <= 1e-6 * abs(self.guess[n]) for n in names):
                 break
         epsilon = np.hypot(*(A @ x - self.target).T)
         value = epsilon.mean() if objective == "mae" else np.sqrt((epsilon**2).mean())
         return dict(self.guess), float(value)
+
+    def _below(self, names: list[str], A: Floats, objective: Objective, tolerance: float) -> Floats:
+        """Solve, and hold a parameter that came out above its upper bound at that bound."""
+        x = self.linear(A, self.target, objective, tolerance=tolerance)
+        for name, most in self.fields.most.items():
+            i = names.index(name)
+            if x[i] > most:
+                others = np.arange(len(names)) != i
+                free = self.rows[:, i] == 0  # the rows of the others alone
+                rest = self.target - A[..., i] * most
+                x[i] = most
+                x[others] = self.linear(
+                    A[..., others],
+                    rest,
+                    objective,
+                    tolerance=tolerance,
+                    bounds=(self.rows[free][:, others], self.low[free]),
+                )
+        return x
 
     def linear(
         self,
@@ -254,27 +273,29 @@ class _Problem:
         objective: Objective,
         weight: Floats | None = None,
         tolerance: float = 1e-6,
+        bounds: tuple[Floats, Floats] | None = None,
     ) -> Floats:
         """Minimise sum |A x - b| (mae) or its squares (rmse) with lower bounds on combinations of x.
 
         The problem is convex: where the free minimum breaks a bound, the answer is the best of the minima on the faces that
         the bounds have, among those that break none. There are few bounds, so all faces are tried.
         """
+        rows, low = bounds or (self.rows, self.low)
         w = np.ones(len(b)) if weight is None else weight
         floor = 1e-6 * self.scale
         x = _least(A, b, w, objective, floor, tolerance)
-        if (self.rows @ x >= self.low).all():
+        if (rows @ x >= low).all():
             return x
-        back = np.linalg.inv(self.rows)
+        back = np.linalg.inv(rows)
         B = A @ back  # the unknowns y = rows x have the bounds themselves
         found: list[tuple[float, Floats]] = []
-        for face in product((False, True), repeat=len(self.low)):
+        for face in product((False, True), repeat=len(low)):
             held = np.array(face)
-            y = self.low.copy()
+            y = low.copy()
             if not held.all():
                 rest = b - B[..., held] @ y[held]
                 y[~held] = _least(B[..., ~held], rest, w, objective, floor, tolerance)
-            if held.any() and (y >= self.low).all():
+            if held.any() and (y >= low).all():
                 epsilon = np.hypot(*(B @ y - b).T)
                 found.append((float(w @ (epsilon if objective == "mae" else epsilon**2)), y))
         x = back @ min(found, key=lambda end: end[0])[1]

@@ -102,6 +102,11 @@ class UnitFields(Protocol):
         ...
 
     @property
+    def most(self) -> Mapping[str, float]:
+        """Upper bounds of linear parameters that have one; such a parameter has a row of its own in ``least``."""
+        ...
+
+    @property
     def search(self) -> Mapping[str, tuple[float, float]]:
         """Further continuous parameters with their bounds."""
         ...
@@ -180,6 +185,8 @@ class SplineFields:
             np.array([[1.0, 0.0, 0.0], [1.0, 0.5, 0.0], [0.0, 0.0, 1.0]]),
             np.array([0.0, 0.0, 1e-3]),
         )
+        # a tip pushes tissue no further than it is deep: beyond that its push fades as fast as sigma grows, and sigma has no end
+        self.most = {"sigma": max((pose.depth for pose in observation.poses), default=0.0) or np.inf}
         self.search = {"length": length} | ({"alpha3": alpha3} if observation.rests else {})
         self.levels = {"delta": tuple(delta)}
         self._scene = AnchoredKernel.factor(
@@ -286,6 +293,7 @@ class ForceFields:
         self.model, self.observation = model, observation
         self.linear = ("tip", "friction")
         self.least = (np.eye(2), np.zeros(2))
+        self.most: dict[str, float] = {}
         self.search = {"alpha3": alpha3} if observation.rests else {}
         self.levels: dict[str, tuple[float, ...]] = {}
         unit = [self._unit(pose) for pose in observation.poses]

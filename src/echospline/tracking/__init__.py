@@ -9,7 +9,17 @@ if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.tracking.carrier_phase import CarrierPhase
     from echospline.tracking.dense_flow import DenseFlow
     from echospline.tracking.region import grid_over, inside_ahead, region_ahead
-    from echospline.tracking.tracker import FlowTracker, Reference, Track, Tracker, grey_pair, track
+    from echospline.tracking.tracker import (
+        FlowTracker,
+        Frame,
+        Frames,
+        Reference,
+        Track,
+        Tracker,
+        grey_pair,
+        levelled,
+        track,
+    )
     from echospline.tracking.tracks import read_track, write_track
 else:
     on_demand(__name__)
@@ -19,12 +29,15 @@ __all__ = [
     "CarrierPhase",
     "DenseFlow",
     "FlowTracker",
+    "Frame",
+    "Frames",
     "Reference",
     "Track",
     "Tracker",
     "grey_pair",
     "grid_over",
     "inside_ahead",
+    "levelled",
     "read_track",
     "region_ahead",
     "track",

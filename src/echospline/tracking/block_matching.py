@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from echospline.errors import InputError
 from echospline.scene import Floats
-from echospline.tracking.tracker import Frame, Motion, grey_pair
+from echospline.tracking.signal import at_points, has_signal
+from echospline.tracking.tracker import Frame, Motion, grey_pair, levelled
 
 
 @dataclass(frozen=True)
@@ -44,10 +45,10 @@ class BlockMatching:
     def motion(self, before: Frame, after: Frame, points: Floats) -> Motion:
         """Measure the motion of the tissue at ``points`` (n, 2) mm; confidence is the height of the correlation's peak.
 
-        Points whose block or search area leaves the picture, and peaks at the border of the search, have
+        Points without signal, points whose block or search area leaves the picture, and peaks at the border of the search, have
         confidence 0.
         """
-        a, b, grid = grey_pair(before, after)
+        a, b, grid = grey_pair(*levelled(before, after))
         f = self.interpolation
         fine = np.asarray(grid.spacing) / f
         first, second = (
@@ -72,7 +73,10 @@ class BlockMatching:
             shift = jx + _vertex(score[jy, jx - 1 : jx + 2]), jy + _vertex(score[jy - 1 : jy + 2, jx])
             u[i] = (shift - reach) * fine
             confidence[i] = max(best, 0.0)
-        return Motion(u, confidence)
+        alive = at_points(has_signal(a, grid), grid, points) & at_points(
+            has_signal(b, grid), grid, points + u
+        )
+        return Motion(u, np.where(alive, confidence, 0.0))
 
 
 def _vertex(three: NDArray[np.generic]) -> float:

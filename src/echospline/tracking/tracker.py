@@ -6,7 +6,7 @@ the point where the tissue was at rest (frame 0), never to a pixel.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
@@ -17,10 +17,8 @@ from scipy.spatial import cKDTree
 
 from echospline.errors import InputError
 from echospline.scene import (
-    Cine,
     Display,
     Echo,
-    EchoCine,
     Floats,
     NeedlePose,
     RegularGrid,
@@ -29,6 +27,7 @@ from echospline.scene import (
 )
 from echospline.tracking.carrier_phase import CarrierPhase
 from echospline.tracking.dense_flow import DenseFlow, Grey
+from echospline.tracking.signal import at_points, has_signal
 
 Frame = UltrasoundImage | Echo
 Reference = Literal["keyframe", "first", "previous"]
@@ -48,6 +47,19 @@ class Motion:
 
     displacement: Floats
     confidence: Floats
+
+
+class Frames(Protocol):
+    """Frames with their times, which can be iterated more than once: `Cine`, `EchoCine`, or frames that are read meanwhile."""
+
+    @property
+    def times(self) -> Floats:
+        """Seconds, one per frame."""
+        ...
+
+    def __len__(self) -> int: ...
+
+    def __iter__(self) -> Iterator[Frame]: ...
 
 
 class Tracker(Protocol):
@@ -115,6 +127,7 @@ class FlowTracker:
 
     def motion(self, before: Frame, after: Frame, points: Floats) -> Motion:
         """Measure the motion of the tissue at ``points`` (n, 2) mm; points outside the picture have confidence 0."""
+        before, after = levelled(before, after)
         a, b, grid = grey_pair(before, after)
         spacing = np.asarray(grid.spacing, dtype=np.float32)
         u = self.search.flow(a, b) * spacing
@@ -124,7 +137,9 @@ class FlowTracker:
             there = _pull(back, u / spacing)
             error = np.hypot(*np.moveaxis(u + there, -1, 0))
             confidence = confidence / (1.0 + (error / self.tolerance) ** 2)
-        inside = before.grid.contains(points)
+        alive = has_signal(a, grid) & (_pull(has_signal(b, grid).astype(np.float32), u / spacing) > 0.5)
+        confidence = np.where(alive, confidence, np.float32(0.0))
+        inside = before.grid.contains(points) & at_points(alive, grid, points)
         quality = np.where(inside, np.clip(sample(confidence, grid, points), 0.0, 1.0), 0.0)
         if self.phase is not None and isinstance(before, Echo) and isinstance(after, Echo):
             refined, _ = self.phase.refine(before, after, regrid(u, grid, before.grid))
@@ -133,7 +148,7 @@ class FlowTracker:
 
 
 def track(
-    cine: Cine | EchoCine | Sequence[Frame],
+    cine: Frames | Sequence[Frame],
     points: Floats,
     tracker: Tracker,
     *,
@@ -149,8 +164,8 @@ def track(
 
     Parameters
     ----------
-    cine : Cine, EchoCine or sequence of frames
-        Frame 0 is the reference.
+    cine : Cine, EchoCine, Frames or sequence of frames
+        Frame 0 is the reference. Frames are taken one after the other; three are held at a time.
     points : ndarray, shape (n, 2)
         Positions in frame 0, mm.
     tracker : Tracker
@@ -166,7 +181,7 @@ def track(
         One per frame: points within ``needle_radius`` mm of the shaft are not tissue and get confidence 0.
     threshold : float
         Points of lower confidence, and those that disagree with their neighbours, get their neighbours' motion
-        (and a low confidence).
+        (and a low confidence). Where a frame has no signal, the confidence is 0, in frame 0 as well.
     progress : callable
         Wraps the iteration over frames.
 
@@ -177,8 +192,9 @@ def track(
     """
     x = as_points(points)
     count = len(cine)
-    if isinstance(cine, Cine | EchoCine):
-        times = np.asarray(cine.times, dtype=np.float64)
+    own = getattr(cine, "times", None)
+    if own is not None:
+        times = np.asarray(own, dtype=np.float64)
     if times is None or len(times) != count:
         raise InputError(f"tracking {count} frames needs {count} times in s")
     if needle is not None and len(needle) != count:
@@ -187,13 +203,17 @@ def track(
         raise InputError(f"reference is keyframe, first or previous; got {reference!r}")
     if not step > 0:
         raise InputError(f"step must be a positive length in mm; got {step}")
-    displacement, confidence = np.zeros((count, len(x), 2)), np.ones((count, len(x)))
+    frames = iter(cine)
+    key_frame = previous = _next(frames, 0, count)
+    displacement, confidence = np.zeros((count, len(x), 2)), np.zeros((count, len(x)))
+    grey, _, grid = grey_pair(*levelled(key_frame, key_frame))
+    confidence[0] = at_points(has_signal(grey, grid), grid, x)
     neighbours = Neighbours.of(x)
     key, keys = 0, [0]
 
-    def link(k: int) -> Motion:
+    def link(frame: Frame, k: int) -> Motion:
         p = x + displacement[key]
-        found = tracker.motion(cine[key], cine[k], p)
+        found = tracker.motion(key_frame, frame, p)
         quality = found.confidence.copy()
         for pose in (needle[key], needle[k]) if needle is not None else ():
             if pose is not None and pose.depth > 0:
@@ -204,19 +224,28 @@ def track(
     if needle is not None and needle[0] is not None and needle[0].depth > 0:
         confidence[0, needle[0].closest(x)[1] < needle_radius] = 0.0
     for k in progress(range(1, count)):
-        found = link(k)
+        frame = _next(frames, k, count)
+        found = link(frame, k)
         trusted = found.confidence >= threshold
         peak = np.hypot(*found.displacement[trusted].T).max(initial=0.0)
         if reference == "keyframe" and peak > step and key < k - 1:
-            key = k - 1
+            key, key_frame = k - 1, previous
             keys.append(key)
-            found = link(k)
+            found = link(frame, k)
         displacement[k] = displacement[key] + found.displacement
         confidence[k] = np.minimum(confidence[key], found.confidence)
+        previous = frame
         if reference == "previous":
-            key = k
+            key, key_frame = k, frame
             keys.append(key)
     return Track(x, times, displacement, confidence, tuple(keys))
+
+
+def _next(frames: Iterator[Frame], k: int, count: int) -> Frame:
+    frame = next(frames, None)
+    if frame is None:
+        raise InputError(f"the cine ends after {k} of {count} frames")
+    return frame
 
 
 @dataclass(frozen=True)
@@ -257,6 +286,23 @@ class Neighbours:
         return Motion(u, quality)
 
 
+def levelled(before: Frame, after: Frame) -> tuple[Frame, Frame]:
+    """Scale echoes by the root mean square of ``before``, whatever unit they are in; pictures stay as they are."""
+    if not (isinstance(before, Echo) and isinstance(after, Echo)):
+        return before, after
+    level = float(np.sqrt(np.mean(np.abs(before.iq).astype(np.float64) ** 2)))
+    if not level > 0:
+        return before, after
+
+    def scaled(echo: Echo) -> Echo:
+        return Echo(
+            (np.asarray(echo.iq, np.complex128) / level).astype(np.complex64), echo.grid, echo.carrier
+        )
+
+    first = scaled(before)
+    return first, first if after is before else scaled(after)
+
+
 def grey_pair(before: Frame, after: Frame) -> tuple[Grey, Grey, RegularGrid]:
     """Return both frames as 8-bit grey pictures of one grid."""
     if isinstance(before, Echo) and isinstance(after, Echo):
@@ -271,6 +317,7 @@ def grey_pair(before: Frame, after: Frame) -> tuple[Grey, Grey, RegularGrid]:
     if a.ndim == 3:
         a, b = (np.asarray(np.rint(f.mean(axis=2)), dtype=f.dtype) for f in (a, b))
     if a.dtype != np.uint8 or b.dtype != np.uint8:
+        a, b = (f.astype(np.float64) for f in (a, b))
         low, high = min(a.min(), b.min()), max(a.max(), b.max())
         scale = 255.0 / (high - low) if high > low else 0.0
         a, b = (np.rint((f - low) * scale).astype(np.uint8) for f in (a, b))

@@ -6,27 +6,30 @@ import logging
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from math import isfinite
 from pathlib import Path
 
 import numpy as np
-import pydicom
 
 from echospline.errors import InputError
+from echospline.io.declared import followed
+from echospline.io.dicom.header import declared
 from echospline.io.dicom.pixels import (
     GDCM,
+    PREAMBLE_MARK,
     check_decoder,
     check_deflated,
     coloured,
     dtype_of,
     is_mislabelled,
     raw_frames,
+    read_dataset,
     upright,
 )
-from echospline.io.dicom.regions import doubts, pixel_spacing, regions_of, tissue_of
+from echospline.io.dicom.regions import doubts, regions_of, tissue_of
+from echospline.io.kind import head
 from echospline.io.lossless import lossless_frames
 from echospline.io.recording import Recording, check_size, decoding, quietly
-from echospline.scene import Floats, Pixels
+from echospline.scene import Pixels
 
 _DEFERRED = 2**16
 """Elements longer than this (private data, mostly) are not loaded."""
@@ -38,7 +41,7 @@ def open_dicom(path: Path, limit: float) -> Recording:
     Parameters
     ----------
     path : Path
-        With the DICM mark at byte 128.
+        With the DICM mark at byte 128, or without its preamble.
     limit : float
         MiB of decoded pixels.
 
@@ -51,7 +54,7 @@ def open_dicom(path: Path, limit: float) -> Recording:
     """
     with decoding(path, "DICOM"), _quiet():
         check_deflated(path, limit)
-        header = pydicom.dcmread(path, stop_before_pixels=True, defer_size=_DEFERRED)
+        header = read_dataset(path, stop_before_pixels=True, defer_size=_DEFERRED)
         missing = [
             name for name in ("Rows", "Columns", "PhotometricInterpretation") if header.get(name) is None
         ]
@@ -74,25 +77,26 @@ def open_dicom(path: Path, limit: float) -> Recording:
         regions, notes = regions_of(header, rows, columns)
         tissue = tissue_of(regions)
         notes += doubts(header, regions, tissue, (0, 0, columns, rows))
-        times = _times(header, frames)
+        said = declared(header, frames, tissue.spacing if tissue else None)
         mislabelled = is_mislabelled(path, header)
         if mislabelled:
             notes.append("labelled RGB but its JPEG frames hold YCbCr: converted")
         syntax = header.file_meta.TransferSyntaxUID
-        stored = int(header.get("BitsStored") or dtype.itemsize * 8)
-        spacing = tissue.spacing if tissue else pixel_spacing(header)
+        bits = int(header.get("BitsStored") or dtype.itemsize * 8)
+        if PREAMBLE_MARK not in head(path)[128:132]:
+            notes.append("DICOM without its preamble: read all the same")
 
     def shown(frame: int | None) -> Iterator[Pixels]:
         shape = (rows, columns, 3) if channels == 3 and not palette else (rows, columns)
         if syntax in GDCM:
             raws = lossless_frames(path, shape, stored_dtype, frame, syntax.name)
         else:
-            raws = raw_frames(path, syntax, frame, mislabelled)
+            raws = raw_frames(path, header, frame, mislabelled)
         for raw in raws:
             if palette:
                 yield coloured(raw, header)
             else:
-                yield upright(raw, stored) if colours == "MONOCHROME1" else raw
+                yield upright(raw, bits) if colours == "MONOCHROME1" else raw
 
     def decode(frame: int | None, colour: bool) -> Iterator[Pixels]:
         count = 0
@@ -107,11 +111,11 @@ def open_dicom(path: Path, limit: float) -> Recording:
             if frame is None and count != frames:
                 raise InputError(f"{path} declares {frames} frames but holds {count}: it is cut short")
 
-    return Recording(
+    stored = Recording(
         path, f"DICOM, {syntax.name}", rows, columns, frames, channels, dtype, decode,
-        spacing=spacing, region=tissue.box if tissue else None,
-        regions=regions, times=times, single=frames == 1, notes=tuple(notes),
+        region=tissue.box if tissue else None, regions=regions, single=frames == 1, notes=tuple(notes),
     )  # fmt: skip
+    return followed(stored, said)
 
 
 @contextmanager
@@ -126,18 +130,3 @@ def _quiet() -> Iterator[None]:
             yield
     finally:
         logger.setLevel(level)
-
-
-def _times(header: pydicom.Dataset, frames: int) -> Floats | None:
-    """Return the seconds since the first frame from Frame Time Vector, Frame Time (both ms) or a rate."""
-    vector = header.get("FrameTimeVector")
-    if vector is not None and len(np.atleast_1d(vector)) == frames:
-        steps = np.array([float(step) for step in np.atleast_1d(vector)]) / 1000.0
-        steps[0] = 0.0
-        ascending: Floats = np.cumsum(steps)
-        return ascending if np.isfinite(steps).all() and (steps >= 0).all() else None
-    interval = header.get("FrameTime")
-    rate = header.get("CineRate") or header.get("RecommendedDisplayFrameRate")
-    seconds = float(interval) / 1000.0 if interval else 1.0 / float(rate) if rate else 0.0
-    even: Floats = np.arange(frames, dtype=np.float64) * seconds
-    return even if isfinite(seconds) and seconds > 0 else None

@@ -14,8 +14,10 @@ from pydicom.pixels.processing import apply_color_lut
 from pydicom.pixels.utils import iter_pixels
 from pydicom.uid import (
     JPEG2000,
-    UID,
     DeflatedExplicitVRLittleEndian,
+    ExplicitVRBigEndian,
+    ExplicitVRLittleEndian,
+    ImplicitVRLittleEndian,
     JPEG2000Lossless,
     JPEGBaseline8Bit,
     JPEGExtended12Bit,
@@ -41,15 +43,41 @@ _DEFLATE = 1032
 """The most that deflate can compress, so the most that a deflated file can hold per byte."""
 
 
-def raw_frames(path: Path, syntax: UID, frame: int | None, mislabelled: bool) -> Iterator[Pixels]:
-    """Return the frames as pydicom decodes them, read from the disk one by one (a deflated file only as a whole).
+PREAMBLE_MARK = b"DICM"
 
-    The decoder is named because pydicom prefers GDCM where that is installed (see `echospline.io.lossless`).
+
+def read_dataset(path: Path, **options: Any) -> pydicom.Dataset:
+    """Read a file, with or without preamble and meta information; without, the transfer syntax is that of its bytes."""
+    found = pydicom.dcmread(path, force=True, **options)
+    if not hasattr(found, "file_meta"):
+        found.file_meta = pydicom.dataset.FileMetaDataset()
+    if found.file_meta.get("TransferSyntaxUID") is None:
+        implicit, little = found.original_encoding
+        explicit = ExplicitVRLittleEndian if little else ExplicitVRBigEndian
+        found.file_meta.TransferSyntaxUID = ImplicitVRLittleEndian if implicit else explicit
+    return found
+
+
+def raw_frames(path: Path, header: pydicom.Dataset, frame: int | None, mislabelled: bool) -> Iterator[Pixels]:
+    """Return the frames as pydicom decodes them, read from the disk one by one.
+
+    A deflated file, and one without preamble, is read as a whole. The decoder is named because pydicom prefers GDCM
+    where that is installed (see `echospline.io.lossless`).
     """
+    syntax = header.file_meta.TransferSyntaxUID
     options: dict[str, Any] = {"photometric_interpretation": "YBR_FULL"} if mislabelled else {}
-    source: Any = pydicom.dcmread(path) if syntax == DeflatedExplicitVRLittleEndian else path
+    with path.open("rb") as file:
+        bare = file.read(132)[128:] != PREAMBLE_MARK
+    source: Any = read_dataset(path) if bare or syntax == DeflatedExplicitVRLittleEndian else path
     plugin = "pillow" if syntax in PILLOW else ""
-    return iter_pixels(source, indices=None if frame is None else [frame], decoding_plugin=plugin, **options)
+    if frame is None and header.PhotometricInterpretation == "YBR_FULL_422" and not syntax.is_compressed:
+        # pydicom 3.0 reads several such frames only one at a time: it expects the bytes of full chroma of all together
+        for i in range(int(header.get("NumberOfFrames") or 1)):
+            yield from iter_pixels(source, indices=[i], decoding_plugin=plugin, **options)
+        return
+    yield from iter_pixels(
+        source, indices=None if frame is None else [frame], decoding_plugin=plugin, **options
+    )
 
 
 def coloured(indices: Pixels, header: pydicom.Dataset) -> Pixels:
@@ -61,6 +89,9 @@ def coloured(indices: Pixels, header: pydicom.Dataset) -> Pixels:
 
 def check_deflated(path: Path, limit: float) -> None:
     """Refuse a deflated file that may inflate beyond the limit: pydicom inflates it whole."""
+    with path.open("rb") as file:
+        if file.read(132)[128:] != PREAMBLE_MARK:
+            return
     meta = pydicom.filereader.read_file_meta_info(path)
     size = path.stat().st_size * _DEFLATE / MIB
     if meta.get("TransferSyntaxUID") == DeflatedExplicitVRLittleEndian and size > limit:
@@ -109,6 +140,6 @@ def is_mislabelled(path: Path, header: pydicom.Dataset) -> bool:
     syntax = header.file_meta.TransferSyntaxUID
     if header.PhotometricInterpretation != "RGB" or syntax not in (JPEGBaseline8Bit, JPEGExtended12Bit):
         return False
-    full = pydicom.dcmread(path, specific_tags=["PixelData", "NumberOfFrames"])
+    full = read_dataset(path, specific_tags=["PixelData", "NumberOfFrames"])
     frame = get_frame(full.PixelData, 0, number_of_frames=int(full.get("NumberOfFrames") or 1))
     return b"JFIF\x00" in frame[:32] and b"Adobe" not in frame[:1024]

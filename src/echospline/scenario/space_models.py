@@ -1,0 +1,93 @@
+"""The words "green", "tps", "elastic" and "fem" become classes in space here, and [tissue] with its regions becomes tissue in space."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from echospline.errors import InputError
+from echospline.mechanics import Clamps, Elastic, Kernel, NeedleForces, ThinPlate, TPSParameters
+from echospline.mechanics.protocol import SpatialTissueModel
+from echospline.mechanics.spatial_fem_response import SpatialFEMResponse
+from echospline.mechanics.spatial_force_model import SpatialForceModel
+from echospline.mechanics.spatial_landmark_model import IN_SPACE, SpatialLandmarkModel
+from echospline.mechanics.spread import radius_for
+from echospline.scenario.models import MODELS
+from echospline.scenario.scenario import Scenario
+from echospline.scene import SpatialGrid, Tissue
+
+LAW = (
+    "tip",
+    "friction_limit",
+    "bond",
+    "tip_stiffness",
+    "side_stiffness",
+    "viscosity",
+    "station_spacing",
+    "substep",
+    "dead_band",
+)
+"""Keys of [model.forces] that the law in space reads."""
+
+
+def build_spatial_model(
+    scenario: Scenario, grid: SpatialGrid, tissue: Tissue, *, kind: str | None = None
+) -> SpatialTissueModel[Any]:
+    """Build the tissue model of a scenario in space.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Its [space.mesh] and [model].
+    grid : SpatialGrid
+        The mesh.
+    tissue : Tissue
+        In space.
+    kind : {"green", "tps", "elastic", "fem"}, optional
+        Another model than the scenario's, for the same scene.
+
+    Raises
+    ------
+    InputError
+        If the scenario has no [space], there is no such model, or its parameters are invalid.
+    """
+    if scenario.space is None:
+        raise InputError("this scenario is no scene in space: it has no [space] table")
+    kind = kind or scenario.model.kind
+    mesh = scenario.space.mesh
+    if kind in ("green", "fem"):
+        section = scenario.model.forces
+        if section.law != "stick-slip":
+            raise InputError(
+                'model.forces.law = "viscous" is the paper\'s, in the plane; in space the law is "stick-slip"'
+            )
+        forces = NeedleForces(**{name: getattr(section, name) for name in LAW})
+        if kind == "green" and tissue.homogeneous:
+            return SpatialForceModel.green(grid, mesh.clamped, tissue, forces, sliding=mesh.sliding)
+        clamps = Clamps.of(grid, mesh.clamped, sliding=mesh.sliding)
+        cell = (
+            5.0 if kind == "green" else 3.5
+        )  # closed form with a coarse corrector, or finite elements as truth
+        response = SpatialFEMResponse(
+            grid, clamps, tissue, cell=cell, radius=radius_for(forces, tissue, grid)
+        )
+        return SpatialForceModel(response, forces)
+    if kind in ("tps", "elastic"):
+        kernel: Kernel = ThinPlate(3)
+        if kind == "elastic":
+            chosen = scenario.model.elastic
+            nu = tissue.poisson if chosen.poisson is None else chosen.poisson
+            kernel = Elastic(nu, chosen.radius, dimension=3)
+        return SpatialLandmarkModel(
+            grid, mesh.clamped, tissue, _landmarks(scenario), kernel, sliding=mesh.sliding
+        )
+    raise InputError(f"a model is one of {', '.join(MODELS)}; got {kind!r}")
+
+
+def _landmarks(scenario: Scenario) -> TPSParameters:
+    """Return the interaction of [model.landmarks], with the spacings of space where the plane's stand at their defaults."""
+    given = scenario.model.landmarks.model_dump(exclude_none=True)
+    plane = TPSParameters()
+    for name in ("anchor_spacing", "contact_spacing", "delta"):
+        if given.get(name, getattr(plane, name)) == getattr(plane, name):
+            given[name] = getattr(IN_SPACE, name)
+    return TPSParameters(**given)

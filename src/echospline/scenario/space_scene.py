@@ -1,0 +1,108 @@
+"""From a scenario's words to a volume in the scene's frame, its tissue, and what has to be said of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from echospline.errors import InputError
+from echospline.scenario.scenario import Scenario
+from echospline.scenario.space_section import SpaceSection
+from echospline.scene import Layer, Region, Tissue, Volume
+
+SAMPLES = ("sample:kidney", "sample:spine")
+
+
+@dataclass(frozen=True)
+class SpatialScene:
+    """A volume that is ready to be deformed.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Resolved: running it again gives the same.
+    volume : Volume
+        8-bit voxels, y = 0 the skin.
+    tissue : Tissue
+        Its material.
+    notes : tuple of str
+        What was chosen or could not be followed.
+    """
+
+    scenario: Scenario
+    volume: Volume
+    tissue: Tissue
+    notes: tuple[str, ...]
+
+
+def is_spatial(scenario: Scenario) -> bool:
+    """Return whether a scenario is a scene in space: it has [space], or names a sample that is a volume."""
+    return scenario.space is not None or scenario.image.file in SAMPLES
+
+
+def open_spatial(scenario: Scenario, folder: Path) -> SpatialScene:
+    """Read the volume of a scenario, turn its depth along y and choose a window where its voxels need one.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read or is no volume, or a region of the tissue is one of the plane.
+    """
+    space = scenario.space or SpaceSection()
+    name = scenario.image.file
+    notes: list[str] = []
+    if name in SAMPLES:
+        from echospline.laboratory.sample_volumes import sample_volume  # noqa: PLC0415
+
+        volume, tissue = sample_volume(name.removeprefix("sample:"))
+        if tissue is not None:
+            notes.append(
+                f"{name} knows the stiffness of every tissue; the model takes one, tissue.young = {scenario.tissue.young:g} kPa"
+            )
+    else:
+        from echospline.io.volume_reading import read_volume  # noqa: PLC0415
+
+        axis = space.depth_axis or "y"
+        volume = read_volume(folder / name, axis)
+        notes.append(
+            f"depth runs along the volume's {axis} axis"
+            + ("" if space.depth_axis else "; say --depth-axis for another")
+        )
+    volume, space, said = _windowed(volume, space)
+    notes += said
+    resolved = scenario.model_copy(update={"space": space})
+    return SpatialScene(resolved, volume, spatial_tissue(scenario), tuple(notes))
+
+
+def spatial_tissue(scenario: Scenario) -> Tissue:
+    """Build the tissue in space: homogeneous, or with layers by depth.
+
+    Raises
+    ------
+    InputError
+        If a region is a circle, a polygon or a labels image: shapes of the plane.
+    """
+    t = scenario.tissue
+    regions = []
+    for i, region in enumerate(t.region):
+        if region.layer is None:
+            raise InputError(
+                f"tissue.region[{i}] is a shape of the plane; in space a scenario's regions are layers (depths from, to, mm): for spheres, boxes "
+                "and labels build the model in Python"
+            )
+        regions.append(Region(Layer(*region.layer), region.young, region.poisson, region.name))
+    return Tissue(t.young, t.poisson, regions, t.thickness)
+
+
+def _windowed(volume: Volume, space: SpaceSection) -> tuple[Volume, SpaceSection, list[str]]:
+    if volume.voxels.dtype == np.uint8 and space.window is None:
+        return volume, space, []
+    low, high = space.window or (float(volume.voxels.min()), float(volume.voxels.max()))
+    if not high > low:
+        raise InputError(f"the volume has one value, {low:g}, everywhere; nothing would be seen")
+    chosen = (
+        [] if space.window else [f"values {low:g} to {high:g} are shown as black to white (space.window)"]
+    )
+    return volume.windowed(low, high), space.model_copy(update={"window": (low, high)}), chosen
