@@ -17,7 +17,7 @@ import numpy as np
 from scipy import sparse
 
 from echospline.errors import InputError
-from echospline.mechanics.finite_elements import METHOD, MPA, Method, lame
+from echospline.mechanics.finite_elements import MPA, lame
 from echospline.mechanics.half_space import Top, gradient, kelvinlet, tractions
 from echospline.mechanics.hexahedra import FINE_GAUSS, Cells, Hexahedra, lines_for
 from echospline.mechanics.landmarks import SIDES, Clamps
@@ -76,8 +76,6 @@ class SpatialFEMResponse:
         Greatest size of a cell, about, mm.
     radius : float
         Over which a force of the needle is spread, mm.
-    method : {"cholmod", "superlu"}
-        Of the factorisation.
 
     Raises
     ------
@@ -93,7 +91,6 @@ class SpatialFEMResponse:
         *,
         cell: float = 3.5,
         radius: float = 0.7,
-        method: Method = METHOD,
     ) -> None:
         ratios = [tissue.poisson, *(region.poisson for region in tissue.regions)]
         if not max(ratios) < 0.5:
@@ -112,13 +109,13 @@ class SpatialFEMResponse:
         if self.top is not None and abs(low[1]) > 1e-6:
             raise InputError(f"the surface of tissue in space is y = 0; the mesh begins at {low[1]:g} mm")
         self.grid, self.clamps, self.tissue, self.radius, self.cell = grid, clamps, tissue, radius, cell
-        self.mesh = Hexahedra(lines_for(grid, tissue, cell), tissue, clamps, method)
+        self.mesh = Hexahedra(lines_for(grid, tissue, cell), tissue, clamps)
         self._less: dict[Material, sparse.csr_matrix] = {}
         self.mesh.solve(np.zeros((self.mesh.size, 3, 1)))  # factors now
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle what the response was made of; a copy factors anew."""
-        made = partial(SpatialFEMResponse, cell=self.cell, radius=self.radius, method=self.mesh.method)
+        made = partial(SpatialFEMResponse, cell=self.cell, radius=self.radius)
         return made, (self.grid, self.clamps, self.tissue)
 
     def column(self, places: Floats, weights: Floats) -> SpatialColumn:
@@ -173,10 +170,7 @@ class SpatialFEMResponse:
         """Return in one sentence how the tissue is solved."""
         cells = " x ".join(str(len(line) - 1) for line in self.mesh.lines)
         size = max(float(np.diff(line).max()) for line in self.mesh.lines)
-        return (
-            f"closed forms near the needle and {cells} quadratic hexahedra of {size:.2g} mm or less for the rest, factored once "
-            f"({self.mesh.method})"
-        )
+        return f"closed forms near the needle and {cells} quadratic hexahedra of {size:.2g} mm or less for the rest, factored once"
 
     def _materials(self, places: Floats) -> dict[Material, Cells]:
         """Which places lie in tissue of which E and nu."""

@@ -55,8 +55,17 @@ class SpatialForceState:
     torque: Floats
 
 
-LIVE_CELL = 5.0
-"""mm; of the hexahedra that correct Green's function in tissue with regions: 0.9 to 2.4 % in the mean, and set up in a third of a second."""
+LIVE_CELL, LIVE_NODES = 5.0, 10_000
+"""Cells (mm) and nodes at most of the hexahedra that correct Green's function in tissue with regions. In a block of 40 x 35 x 30 mm cells of 5 mm are
+off by 0.9 to 2.4 % in the mean and set up in a third of a second; 10 000 nodes take two seconds, and a station 40 ms."""
+FINE_CELL, FINE_NODES = 3.5, 25_000
+"""The same of finite elements: 1 to 2 %; 25 000 nodes take about 15 s."""
+
+
+def cell_for(grid: SpatialGrid, cell: float, nodes: int) -> float:
+    """Return the size of cells in mm: ``cell``, or more in tissue so large that they would have more than ``nodes`` nodes."""
+    low, high = grid.corners
+    return max(cell, float((8.0 * np.prod(high - low) / nodes) ** (1 / 3)))
 
 
 class SpatialForceModel:
@@ -92,7 +101,7 @@ class SpatialForceModel:
         """Build the model on Green's function in space.
 
         Homogeneous tissue is answered by closed forms and forces outside the faces (`SpaceResponse`), tissue with regions by closed
-        forms and coarse hexahedra that are solved anew for every station (`SpatialFEMResponse` with cells of `LIVE_CELL`).
+        forms and coarse hexahedra that are solved anew for every station (`SpatialFEMResponse` with cells of `LIVE_CELL` or more).
 
         Parameters
         ----------
@@ -117,7 +126,12 @@ class SpatialForceModel:
         spread = radius_for(law, material, grid) if radius is None else radius
         if material.homogeneous:
             return cls(SpaceResponse(grid, clamps, material, radius=spread), law)
-        return cls(SpatialFEMResponse(grid, clamps, material, cell=LIVE_CELL, radius=spread), law)
+        return cls(
+            SpatialFEMResponse(
+                grid, clamps, material, cell=cell_for(grid, LIVE_CELL, LIVE_NODES), radius=spread
+            ),
+            law,
+        )
 
     @classmethod
     def fem(
@@ -129,7 +143,7 @@ class SpatialForceModel:
         *,
         sliding: Iterable[str] = (),
         radius: float | None = None,
-        cell: float = 3.5,
+        cell: float | None = None,
     ) -> SpatialForceModel:
         """Build the model on finite elements: slower and finer, what the others are compared with.
 
@@ -137,8 +151,8 @@ class SpatialForceModel:
         ----------
         grid, clamped, tissue, forces, sliding, radius
             As for `green`.
-        cell : float
-            Greatest size of a cell, about, mm.
+        cell : float, optional
+            Greatest size of a cell, about, mm; by default `FINE_CELL`, or more in large tissue.
 
         Raises
         ------
@@ -148,7 +162,8 @@ class SpatialForceModel:
         material, law = tissue or Tissue(), forces or NeedleForces()
         clamps = Clamps.of(grid, clamped, sliding=sliding)
         spread = radius_for(law, material, grid) if radius is None else radius
-        return cls(SpatialFEMResponse(grid, clamps, material, cell=cell, radius=spread), law)
+        size = cell_for(grid, FINE_CELL, FINE_NODES) if cell is None else cell
+        return cls(SpatialFEMResponse(grid, clamps, material, cell=size, radius=spread), law)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle what the model was made of."""
