@@ -528,11 +528,15 @@ def _forces(
     bond, firm, limit = law.bond * w[on], law.side_stiffness * w[on], law.friction_limit * w[on]
     pressing = law.tip_stiffness * touch if touch > 0 else 1.0
     W = motion.within
-    A = np.block([
-        *([*(W[c][d][here] for d in range(D)), (W[c][0] @ t)[on]] for c in range(D)),
-        [*((t.T @ W[0][d])[:, on] for d in range(D)), t.T @ W[0][0] @ t],
-    ])  # fmt: skip
-    A += np.diag(np.r_[1 / bond, np.tile(1 / firm, D - 1), 1 / pressing])
+    A = np.empty((D * m + 1, D * m + 1))
+    for c in range(D):
+        rows = slice(c * m, (c + 1) * m)
+        for d in range(D):
+            A[rows, d * m : (d + 1) * m] = W[c][d][here]
+        A[rows, -1] = (W[c][0] @ t)[on, 0]
+        A[-1, rows] = (t.T @ W[0][c])[0, on]
+    A[-1, -1] = (t.T @ W[0][0] @ t)[0, 0]
+    A[np.diag_indices(len(A))] += np.r_[1 / bond, np.tile(1 / firm, D - 1), 1 / pressing]
     b = np.concatenate([
         kept * state.friction[on] / bond + motion.eta_gained[on],
         *(kept * G[on] / firm + gap[on] for G, gap in zip(state.side, motion.gap_gained, strict=True)),
