@@ -17,6 +17,8 @@ if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.mechanics.neo_hookean_model import NeoHookeanModel
     from echospline.mechanics.parameters import TPSParameters
     from echospline.mechanics.protocol import TissueModel
+    from echospline.mechanics.spatial_force_model import SpatialForceModel
+    from echospline.mechanics.spatial_landmark_model import SpatialLandmarkModel
     from echospline.mechanics.tps import Solver, TPSModel, anchors_for
 else:
     on_demand(__name__)
@@ -34,6 +36,8 @@ __all__ = [
     "NeedleLoad",
     "NeoHookeanModel",
     "Solver",
+    "SpatialForceModel",
+    "SpatialLandmarkModel",
     "TPSModel",
     "TPSParameters",
     "ThinPlate",

@@ -83,7 +83,7 @@ class AnchoredKernel:
         InputError
             If the anchors alone do not hold the tissue (they lie on one line).
         """
-        fixed = as_points(anchors, "anchors")
+        fixed = as_points(anchors, "anchors", kernel.dimension)
         partly = held is not None and not held.all()
         kernel = kernel.apart() if partly else kernel
         c = kernel.components
@@ -116,7 +116,7 @@ class AnchoredKernel:
 
     @property
     def components(self) -> int:
-        """c, 1 or 2."""
+        """c: 1, or the dimension."""
         return self.kernel.components
 
     def conditioned(self, points: Floats) -> Floats:
@@ -176,11 +176,11 @@ class AnchoredKernel:
 
 
 def interleaved(matrix: Floats, c: int) -> Floats:
-    """Rows in blocks [all x, all y] as rows (x, y) of one point after another."""
+    """Rows in blocks [all x, all y(, all z)] as rows (x, y(, z)) of one point after another."""
     if c == 1:
         return matrix
-    n = len(matrix) // 2
-    rows: Floats = matrix.reshape(2, n, matrix.shape[1]).transpose(1, 0, 2).reshape(matrix.shape)
+    n = len(matrix) // c
+    rows: Floats = matrix.reshape(c, n, matrix.shape[1]).transpose(1, 0, 2).reshape(matrix.shape)
     return rows
 
 

@@ -262,20 +262,8 @@ def factor(K: Any, held: ArrayLike, method: Method = METHOD) -> FactoredStiffnes
         raise InputError("every node is clamped; nothing is left to move")
     rows = K.tocsr()[free]
     inner = rows[:, free].tocsc()
-    return FactoredStiffness(free, method, rows[:, ~free].tocsr(), solver_for(inner, method))
-
-
-def solver_for(A: Any, method: Method) -> Callable[[Floats], Floats]:
-    """Factor a symmetric, positive definite sparse matrix; the function returned solves for right sides (n, k).
-
-    Raises
-    ------
-    MissingExtraError
-        If the method is "cholmod" and kvxopt is not installed.
-    SolverError
-        If the matrix is not positive definite.
-    """
-    return _cholmod(A) if method == "cholmod" else _superlu(A)
+    solve = _cholmod(inner) if method == "cholmod" else _superlu(inner)
+    return FactoredStiffness(free, method, rows[:, ~free].tocsr(), solve)
 
 
 def _components(held: NDArray[Any], n: int) -> NDArray[np.bool_]:

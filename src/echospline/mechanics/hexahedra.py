@@ -8,19 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
+from scipy.sparse.linalg import splu
 
-from echospline.errors import InputError
-from echospline.mechanics.finite_elements import METHOD, MPA, Method, lame, solver_for
+from echospline.errors import InputError, SolverError
+from echospline.mechanics.finite_elements import MPA, lame
 from echospline.mechanics.landmarks import SIDES, Clamps
 from echospline.scene import Floats, Layer, SpatialGrid, Tissue
 
 GAUSS = 3
 """Points per direction: exact for the energy of a cell of one modulus."""
-FINE_GAUSS = 6
+FINE_GAUSS = 5
 """Points per direction in a cell of more than one modulus."""
 MOST_NODES = 40_000
 """Of a mesh that is factored: fill-in grows with the 4/3rd power, and this many take gigabytes and minutes."""
@@ -28,6 +30,8 @@ SAME_LINE = 0.3
 """Share of a cell: an interface this close to a line of the mesh moves that line."""
 
 Cells = NDArray[np.intp]
+Box = tuple[tuple[int, int], tuple[int, int], tuple[int, int]]
+"""First node and the one after the last, along x, y and z."""
 
 
 def lines_for(grid: SpatialGrid, tissue: Tissue, cell: float) -> tuple[Floats, Floats, Floats]:
@@ -73,8 +77,6 @@ class Hexahedra:
         E and nu, at the integration points.
     clamps : Clamps
         Clamped and sliding faces.
-    method : {"cholmod", "superlu"}
-        Of the factorisation.
 
     Raises
     ------
@@ -82,10 +84,8 @@ class Hexahedra:
         If Poisson's ratio is not below 0.5.
     """
 
-    def __init__(
-        self, lines: tuple[Floats, Floats, Floats], tissue: Tissue, clamps: Clamps, method: Method = METHOD
-    ) -> None:
-        self.lines, self.tissue, self.clamps, self.method = lines, tissue, clamps, method
+    def __init__(self, lines: tuple[Floats, Floats, Floats], tissue: Tissue, clamps: Clamps) -> None:
+        self.lines, self.tissue, self.clamps = lines, tissue, clamps
         self.shape = tuple(2 * len(line) - 1 for line in lines)
         self.stiffness = self._assembled(tissue)
 
@@ -143,11 +143,11 @@ class Hexahedra:
         k = loads.shape[2]
         u = np.zeros((3 * self.size, k))
         fixed = self.held.ravel()
-        right = loads.reshape(-1, k)[~fixed]
+        right = loads.reshape(-1, k)[self._order]
         if given is not None:
             u[fixed] = given.reshape(-1, k)[fixed]
             right = right - self._outer @ u[fixed]
-        u[~fixed] = self._inner(right)
+        u[self._order] = self._factors.solve(np.ascontiguousarray(right))
         return u.reshape(self.size, 3, k)
 
     def at(self, values: Floats, points: Floats) -> Floats:
@@ -198,23 +198,29 @@ class Hexahedra:
 
     def moduli(self, points: Floats) -> tuple[Floats, Floats]:
         """Lamé's parameters at points (..., 3), N/mm^2."""
-        young, poisson = self.tissue.at(points.reshape(-1, 3))
-        lam, mu = lame(young, poisson, "strain")
-        return MPA * lam.reshape(points.shape[:-1]), MPA * mu.reshape(points.shape[:-1])
+        return _lame_at(self.tissue, points)
 
     @cached_property
-    def _free(self) -> NDArray[np.bool_]:
-        return ~self.held.ravel()
+    def _order(self) -> NDArray[np.intp]:
+        """Free degrees of freedom in the order of their elimination."""
+        nodes = np.concatenate(list(_dissected(((0, self.shape[0]), (0, self.shape[1]), (0, self.shape[2])))))
+        x, y, z = nodes.T
+        every = 3 * ((z * self.shape[1] + y) * self.shape[0] + x)[:, None] + np.arange(3)
+        order: NDArray[np.intp] = every.ravel()
+        return order[~self.held.ravel()[order]]
 
     @cached_property
     def _outer(self) -> sparse.csr_matrix:
-        rows = self.stiffness.tocsr()[self._free]
-        return rows[:, ~self._free].tocsr()
+        """Stiffness between free and held degrees of freedom."""
+        return self.stiffness.tocsr()[self._order][:, self.held.ravel()].tocsr()
 
     @cached_property
-    def _inner(self):  # type: ignore[no-untyped-def]
-        inner = self.stiffness.tocsr()[self._free][:, self._free].tocsc()
-        return solver_for(inner, self.method)
+    def _factors(self) -> Any:
+        inner = self.stiffness.tocsr()[self._order][:, self._order].tocsc()
+        try:
+            return splu(inner, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        except RuntimeError as singular:
+            raise SolverError("the stiffness matrix is singular; check moduli and clamp a face") from singular
 
     def shares(self, points: Floats) -> tuple[Cells, Floats]:
         """Nodes of the cell of every point, and their shape functions there, each of shape (p, 27)."""
@@ -246,15 +252,41 @@ class Hexahedra:
                 if not len(some):
                     continue
                 volume, shear = _energies(size[some[0]], FINE_GAUSS if fine else GAUSS)
-                l, m = (finer[0][some], finer[1][some]) if fine else (lam[some], mu[some])
+                at_points = (finer[0][some], finer[1][some]) if fine else (lam[some], mu[some])
                 q = volume.shape[0]
-                entries[some] = (l @ volume.reshape(q, -1) + m @ shear.reshape(q, -1)).reshape(-1, 81, 81)
+                energy = at_points[0] @ volume.reshape(q, -1) + at_points[1] @ shear.reshape(q, -1)
+                entries[some] = energy.reshape(-1, 81, 81)
         dofs = (3 * self.cells[:, :, None] + np.arange(3)).reshape(-1, 81)
         rows, columns = np.repeat(dofs, 81, axis=1).ravel(), np.tile(dofs, (1, 81)).ravel()
         K: sparse.csc_matrix = sparse.coo_matrix(
             (entries.ravel(), (rows, columns)), shape=(3 * self.size, 3 * self.size)
         ).tocsc()
         return K
+
+
+def _dissected(box: Box) -> Iterator[NDArray[np.intp]]:
+    """Nodes (i, j, k) of a lattice in nested dissection: both halves of the box, then the plane of nodes between them.
+
+    Planes are those of cells' faces, whose nodes have even numbers. On such a lattice this is factored in a third of the time that minimum degree
+    takes (A. George, SIAM J. Numer. Anal. 10, 1973).
+    """
+    lengths = [end - first for first, end in box]
+    axis = int(np.argmax(lengths))
+    if lengths[axis] <= 4:
+        k, j, i = np.meshgrid(*(np.arange(*side) for side in box[::-1]), indexing="ij")
+        yield np.stack([i.ravel(), j.ravel(), k.ravel()], axis=1)
+        return
+    first, end = box[axis]
+    middle = (first + end) // 2
+    middle -= middle % 2
+    for side in ((first, middle), (middle + 1, end), (middle, middle + 1)):
+        part = list(box)
+        part[axis] = side
+        if side == (middle, middle + 1):
+            k, j, i = np.meshgrid(*(np.arange(*s) for s in part[::-1]), indexing="ij")
+            yield np.stack([i.ravel(), j.ravel(), k.ravel()], axis=1)
+        else:
+            yield from _dissected((part[0], part[1], part[2]))
 
 
 def _lame_at(tissue: Tissue, points: Floats) -> tuple[Floats, Floats]:

@@ -10,15 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 from scipy import sparse
 
 from echospline.errors import InputError
-from echospline.mechanics.finite_elements import METHOD, MPA, Method, lame
+from echospline.mechanics.finite_elements import MPA, lame
 from echospline.mechanics.half_space import Top, gradient, kelvinlet, tractions
-from echospline.mechanics.hexahedra import Cells, Hexahedra, lines_for
+from echospline.mechanics.hexahedra import FINE_GAUSS, Cells, Hexahedra, lines_for
 from echospline.mechanics.landmarks import SIDES, Clamps
 from echospline.mechanics.response import SpatialColumn
 from echospline.mechanics.space_response import ForceField, Forces, shear_modulus
@@ -29,9 +30,6 @@ NEAR = 1.0
 """Of a cell's diagonal: a cell closer to a force than this is integrated point by point, one further away by its nodes."""
 FACE_GAUSS = 4
 """Points per direction on a free or sliding face."""
-CELL_GAUSS = 5
-"""Points per direction in a cell near a force."""
-
 Material = tuple[float, float]
 """E in kPa and nu."""
 
@@ -78,8 +76,6 @@ class SpatialFEMResponse:
         Greatest size of a cell, about, mm.
     radius : float
         Over which a force of the needle is spread, mm.
-    method : {"cholmod", "superlu"}
-        Of the factorisation.
 
     Raises
     ------
@@ -95,7 +91,6 @@ class SpatialFEMResponse:
         *,
         cell: float = 3.5,
         radius: float = 0.7,
-        method: Method = METHOD,
     ) -> None:
         ratios = [tissue.poisson, *(region.poisson for region in tissue.regions)]
         if not max(ratios) < 0.5:
@@ -113,10 +108,15 @@ class SpatialFEMResponse:
         low, _ = grid.corners
         if self.top is not None and abs(low[1]) > 1e-6:
             raise InputError(f"the surface of tissue in space is y = 0; the mesh begins at {low[1]:g} mm")
-        self.grid, self.clamps, self.tissue, self.radius = grid, clamps, tissue, radius
-        self.mesh = Hexahedra(lines_for(grid, tissue, cell), tissue, clamps, method)
+        self.grid, self.clamps, self.tissue, self.radius, self.cell = grid, clamps, tissue, radius, cell
+        self.mesh = Hexahedra(lines_for(grid, tissue, cell), tissue, clamps)
         self._less: dict[Material, sparse.csr_matrix] = {}
         self.mesh.solve(np.zeros((self.mesh.size, 3, 1)))  # factors now
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle what the response was made of; a copy factors anew."""
+        made = partial(SpatialFEMResponse, cell=self.cell, radius=self.radius)
+        return made, (self.grid, self.clamps, self.tissue)
 
     def column(self, places: Floats, weights: Floats) -> SpatialColumn:
         """Answer unit forces along x, y and z that are spread over places (m, 3) in mm by weights (m,); see `SpatialResponse`."""
@@ -170,10 +170,7 @@ class SpatialFEMResponse:
         """Return in one sentence how the tissue is solved."""
         cells = " x ".join(str(len(line) - 1) for line in self.mesh.lines)
         size = max(float(np.diff(line).max()) for line in self.mesh.lines)
-        return (
-            f"closed forms near the needle and {cells} quadratic hexahedra of {size:.2g} mm or less for the rest, factored once "
-            f"({self.mesh.method})"
-        )
+        return f"closed forms near the needle and {cells} quadratic hexahedra of {size:.2g} mm or less for the rest, factored once"
 
     def _materials(self, places: Floats) -> dict[Material, Cells]:
         """Which places lie in tissue of which E and nu."""
@@ -211,13 +208,13 @@ class SpatialFEMResponse:
             self._less[material] = self.mesh.difference(*material)
         less = self._less[material]
         u = moves.reshape(3 * n, 3)
-        loads = (less @ u).reshape(n, 3, 3)
+        loads: Floats = (less @ u).reshape(n, 3, 3)
         # cells near a force: what the nodes said is replaced by integration
         lam0, mu0 = (MPA * float(m) for m in lame(*material, "strain"))
         first, size = self.mesh.extents
         gap = np.maximum(np.maximum(first[:, None] - places, places - (first + size)[:, None]), 0.0)
         near = np.linalg.norm(gap, axis=2).min(axis=1) < NEAR * np.linalg.norm(size, axis=1)
-        where = self.mesh.integration_points(CELL_GAUSS, np.flatnonzero(near))
+        where = self.mesh.integration_points(FINE_GAUSS, np.flatnonzero(near))
         lam, mu = self.mesh.moduli(where)
         differs = ((lam != lam0) | (mu != mu0)).any(axis=1)
         where, lam, mu = where[differs], lam[differs] - lam0, mu[differs] - mu0
@@ -226,7 +223,7 @@ class SpatialFEMResponse:
         exact = self._slopes(where.reshape(-1, 3), places, weights, material)
         exact = exact.reshape(*where.shape[:2], 3, 3, 3)
         which = np.flatnonzero(near)[differs]
-        for i, (cell, dN, w) in enumerate(self.mesh.strains(which, CELL_GAUSS)):
+        for i, (cell, dN, w) in enumerate(self.mesh.strains(which, FINE_GAUSS)):
             nodes = self.mesh.cells[cell]
             nodal = np.einsum("qad,aik->qikd", dN, moves[nodes])
             slope = exact[i] - nodal

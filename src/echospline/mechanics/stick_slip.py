@@ -484,11 +484,14 @@ def _solve(
     exists = np.array([s.share > 0 for s in track.stations], dtype=np.float64)
     furthest = min(state.cut + RUN_AHEAD * travel, (len(track) - 1) * h)
     cut, moved = state.cut, state.moved
+    touched = float(_front(state.cut, len(track), h) @ exists)
+    held = _held_before(state.friction, state.covered, state.push, touched, law)
     pairs: list[tuple[float, float]] = []  # fronts tried, and how far each lagged behind
     for _ in range(MOST_REPEATS):
         w, weights = _covered(motion.eta - moved @ axis, cut, track, h), _front(cut, len(track), h)
         touch = float(weights @ exists)
-        F, G, T = _forces(state, motion, w, weights, touch, dt, law)
+        F, G, T = _forces(state, motion, w, weights, touch, dt, law, held)
+        held = _held_before(F, w, T, touch, law)
         f = _vectors(F + weights * T, G, axis, motion.across)
         moved = np.einsum("icjd,jd->ic", track.compliance, f)
         eta = motion.eta - moved @ axis
@@ -516,6 +519,7 @@ def _forces(
     touch: float,
     dt: float,
     law: NeedleForces,
+    held: NDArray[np.int8],
 ) -> tuple[Floats, Floats, float]:
     """F, G (D - 1, k) and T for covered lengths w and a tip between the stations of these weights, ``touch`` of it in the tissue."""
     on = np.flatnonzero(w > 0)
@@ -524,21 +528,26 @@ def _forces(
     bond, firm, limit = law.bond * w[on], law.side_stiffness * w[on], law.friction_limit * w[on]
     pressing = law.tip_stiffness * touch if touch > 0 else 1.0
     W = motion.within
-    A = np.block([
-        *([*(W[c][d][here] for d in range(D)), (W[c][0] @ t)[on]] for c in range(D)),
-        [*((t.T @ W[0][d])[:, on] for d in range(D)), t.T @ W[0][0] @ t],
-    ])  # fmt: skip
-    A += np.diag(np.r_[1 / bond, np.tile(1 / firm, D - 1), 1 / pressing])
+    A = np.empty((D * m + 1, D * m + 1))
+    for c in range(D):
+        rows = slice(c * m, (c + 1) * m)
+        for d in range(D):
+            A[rows, d * m : (d + 1) * m] = W[c][d][here]
+        A[rows, -1] = (W[c][0] @ t)[on, 0]
+        A[-1, rows] = (t.T @ W[0][c])[0, on]
+    A[-1, -1] = (t.T @ W[0][0] @ t)[0, 0]
+    A[np.diag_indices(len(A))] += np.r_[1 / bond, np.tile(1 / firm, D - 1), 1 / pressing]
     b = np.concatenate([
         kept * state.friction[on] / bond + motion.eta_gained[on],
         *(kept * G[on] / firm + gap[on] for G, gap in zip(state.side, motion.gap_gained, strict=True)),
         [weights @ motion.eta],
     ])  # fmt: skip
     free = np.full((D - 1) * m, np.inf)
+    guess = np.concatenate([held[on], np.zeros(len(free), dtype=np.int8), held[-1:]])
     soft = np.zeros(D * m + 1)
     if law.viscosity > 0:
         soft[:m] = dt / (law.viscosity * w[on])
-    z = solve_box(A, b, np.r_[-limit, -free, 0.0], np.r_[limit, free, law.tip * touch], soft)
+    z = solve_box(A, b, np.r_[-limit, -free, 0.0], np.r_[limit, free, law.tip * touch], soft, guess)
     F, side = np.zeros(len(w)), np.zeros((D - 1, len(w)))
     F[on], side[:, on] = z[:m], z[m:-1].reshape(D - 1, m)
     return F, side, float(z[-1])
@@ -555,7 +564,19 @@ def _next_front(pairs: list[tuple[float, float]], least: float, most: float) -> 
     return min(max(cut + step, least), most)
 
 
-def solve_box(A: Floats, b: Floats, low: Floats, high: Floats, soft: Floats) -> Floats:
+def _held_before(F: Floats, covered: Floats, T: float, touch: float, law: NeedleForces) -> NDArray[np.int8]:
+    """Guess which bounds hold from friction and tip force of a solution before: -1, 0 or 1 for every station, then for the tip."""
+    limit = law.friction_limit * covered * (1.0 - 1e-9)
+    held = np.zeros(len(F) + 1, dtype=np.int8)
+    held[:-1][(covered > 0) & (limit <= F)] = 1
+    held[:-1][(covered > 0) & (-limit >= F)] = -1
+    held[-1] = 1 if law.tip * touch * (1.0 - 1e-9) <= T else -1 if T <= 0.0 else 0
+    return held
+
+
+def solve_box(
+    A: Floats, b: Floats, low: Floats, high: Floats, soft: Floats, guess: NDArray[np.int8] | None = None
+) -> Floats:
     """Minimise z.A z / 2 - b.z with low <= z <= high, where a bound may be soft.
 
     Parameters
@@ -566,6 +587,8 @@ def solve_box(A: Floats, b: Floats, low: Floats, high: Floats, soft: Floats) -> 
         Bounds may be infinite.
     soft : ndarray, shape (n,)
         Beyond a bound z costs soft (z - bound)^2 / 2; 0 is a hard bound.
+    guess : ndarray of int8, shape (n,), optional
+        Which bounds may hold: -1 the lower, 1 the upper. It changes how soon the solution is found, and not the solution.
 
     Returns
     -------
@@ -574,7 +597,7 @@ def solve_box(A: Floats, b: Floats, low: Floats, high: Floats, soft: Floats) -> 
         Should that come back to an earlier guess, the first wrong bound alone is corrected, which ends (Murty 1974); and
         should rounding prevent even that, Gauss-Seidel sweeps converge.
     """
-    held = np.zeros(len(b), dtype=np.int8)
+    held = np.zeros(len(b), dtype=np.int8) if guess is None else guess.copy()
     for attempt in range(MOST_GUESSES + MOST_CHANGES * len(b)):
         z = _with_bounds(A, b, low, high, soft, held)
         guess = _bounds_held(A, b, low, high, soft, held, z)

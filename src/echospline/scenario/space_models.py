@@ -5,12 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from echospline.errors import InputError
-from echospline.mechanics import Clamps, Elastic, Kernel, NeedleForces, ThinPlate, TPSParameters
+from echospline.mechanics import Elastic, Kernel, NeedleForces, ThinPlate, TPSParameters
 from echospline.mechanics.protocol import SpatialTissueModel
-from echospline.mechanics.spatial_fem_response import SpatialFEMResponse
 from echospline.mechanics.spatial_force_model import SpatialForceModel
 from echospline.mechanics.spatial_landmark_model import IN_SPACE, SpatialLandmarkModel
-from echospline.mechanics.spread import radius_for
 from echospline.scenario.models import MODELS
 from echospline.scenario.scenario import Scenario
 from echospline.scene import SpatialGrid, Tissue
@@ -61,16 +59,8 @@ def build_spatial_model(
                 'model.forces.law = "viscous" is the paper\'s, in the plane; in space the law is "stick-slip"'
             )
         forces = NeedleForces(**{name: getattr(section, name) for name in LAW})
-        if kind == "green" and tissue.homogeneous:
-            return SpatialForceModel.green(grid, mesh.clamped, tissue, forces, sliding=mesh.sliding)
-        clamps = Clamps.of(grid, mesh.clamped, sliding=mesh.sliding)
-        cell = (
-            5.0 if kind == "green" else 3.5
-        )  # closed form with a coarse corrector, or finite elements as truth
-        response = SpatialFEMResponse(
-            grid, clamps, tissue, cell=cell, radius=radius_for(forces, tissue, grid)
-        )
-        return SpatialForceModel(response, forces)
+        made = SpatialForceModel.green if kind == "green" else SpatialForceModel.fem
+        return made(grid, mesh.clamped, tissue, forces, sliding=mesh.sliding)
     if kind in ("tps", "elastic"):
         kernel: Kernel = ThinPlate(3)
         if kind == "elastic":

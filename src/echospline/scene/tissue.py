@@ -144,7 +144,7 @@ class Box:
     def contains(self, points: Floats) -> Mask:
         """Test which points lie between the corners."""
         _refuse_other(points, 3, "a box", "a polygon")
-        inside: Mask = ((points >= self.low) & (points <= self.high)).all(axis=1)
+        inside: Mask = np.logical_and.reduce((points >= self.low) & (points <= self.high), axis=1)
         return inside
 
 
