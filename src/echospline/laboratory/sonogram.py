@@ -340,30 +340,41 @@ class SpatialPhantom:
     def _bricks_of(
         self, lattice: _Lattice, plane: ImagingPlane, displacement: SpatialDisplacement | None
     ) -> NDArray[np.intp]:
-        """Return the bricks that the slab may reach; where tissue moves, with the difference between neighbours to spare."""
+        """Return the bricks that the slab may reach.
+
+        Where tissue moves, a brick may lie anywhere between the displacements of its corners and its centre, and half of their
+        difference further: displacement that varies within less than half a brick (1.5 mm) may leave scatterers out.
+        """
         s = self.scattering
-        x, y, z = ((np.arange(n) + 0.5) * h + o for n, h, o in zip(s.bricks, s.size, s.low, strict=True))
-        Z, Y, X = np.meshgrid(z, y, x, indexing="ij")
-        centres = np.stack((X.ravel(), Y.ravel(), Z.ravel()))
-        slack = 0.0
+        half = s.size / 2.0
+        centres = _mesh(
+            [low + (np.arange(n) + 0.5) * h for n, h, low in zip(s.bricks, s.size, s.low, strict=True)]
+        )
+        place = np.stack(_in_plane(centres.reshape(3, -1), plane))
+        reach = (np.abs(plane.matrix[:3, :3]).T @ half)[:, None]
+        low, high = place - reach, place + reach
         if displacement is not None:
-            moved = _displaced(displacement, centres).reshape(3, *X.shape)
-            centres = centres + moved.reshape(3, -1)
-            slack = max(
-                (float(np.abs(np.diff(moved, axis=a)).max()) for a in (1, 2, 3) if moved.shape[a] > 1),
-                default=0.0,
+            corners = _mesh(
+                [low + np.arange(n + 1) * h for n, h, low in zip(s.bricks, s.size, s.low, strict=True)]
             )
-        u, v, e = _in_plane(centres, plane)
-        reach_u, reach_v, reach_e = np.abs(plane.matrix[:3, :3]).T @ (s.size / 2.0) + slack
-        sigma = np.sqrt(np.maximum(lattice.slice_variance(v - reach_v), lattice.slice_variance(v + reach_v)))
+            turn = plane.matrix[:3, :3].T
+            inside = (turn @ _displaced(displacement, centres.reshape(3, -1))).reshape(centres.shape)
+            at = (turn @ _displaced(displacement, corners.reshape(3, -1))).reshape(corners.shape)
+            least, most = inside, inside
+            for k, j, i in np.ndindex(2, 2, 2):
+                nz, ny, nx = centres.shape[1:]
+                corner = at[:, k : k + nz, j : j + ny, i : i + nx]
+                least, most = np.minimum(least, corner), np.maximum(most, corner)
+            spare = (most - least) / 2.0
+            low = low + (least - spare).reshape(3, -1)
+            high = high + (most + spare).reshape(3, -1)
         probe = lattice.probe
-        if probe.shape == "curved":  # range grows beside the middle
-            d = np.hypot(u, v + probe.radius) - probe.radius
-            reach = reach_u + reach_v
-            sigma = np.sqrt(np.maximum(lattice.slice_variance(d - reach), lattice.slice_variance(d + reach)))
-        within = np.abs(e) - reach_e < CUT * sigma
-        within &= np.abs(u) - reach_u < probe.half_width + MARGIN
-        within &= (v + reach_v > probe.top - MARGIN) & (v - reach_v < probe.depth + MARGIN)
+        # Range is depth for a linear array; beside the middle of a curved one it is more, by at most the lateral distance.
+        beside = np.maximum(np.abs(low[0]), np.abs(high[0])) if probe.shape == "curved" else 0.0
+        sigma = np.sqrt(np.maximum(lattice.slice_variance(low[1]), lattice.slice_variance(high[1] + beside)))
+        within = (low[2] < CUT * sigma) & (high[2] > -CUT * sigma)
+        within &= (low[0] < probe.half_width + MARGIN) & (high[0] > -probe.half_width - MARGIN)
+        within &= (high[1] > probe.top - MARGIN) & (low[1] < probe.depth + MARGIN)
         return np.flatnonzero(within)
 
     def _reflected(
@@ -614,6 +625,12 @@ class _Lattice:
         spectrum *= band
         shaped: Complexes = fft.ifft(spectrum, axis=1, overwrite_x=True)
         return shaped
+
+
+def _mesh(axes: Sequence[Floats]) -> Floats:
+    """Return coordinates (3, nz, ny, nx) of the lattice with these x, y and z."""
+    Z, Y, X = np.meshgrid(*axes[::-1], indexing="ij")
+    return np.stack((X, Y, Z))
 
 
 def _in_plane(points: Reals, plane: ImagingPlane) -> tuple[Reals, Reals, Reals]:
