@@ -51,7 +51,7 @@ APERTURE = 30.0
 """mm; largest aperture: below f_number times this, the beam widens with depth."""
 LINE, SAMPLE = 0.25, 0.11
 """mm; lattice of the echoes. LINE holds the lateral frequencies of beams steered by up to 15 degrees at 3.5 MHz."""
-COLUMN = 0.6
+COLUMN = 0.4
 """mm; columns of a face further apart along the picture would be seen singly by the beam."""
 COARSE = (0.75, 0.5)
 """mm (lateral, depth); lattice on which attenuation is summed: shadows have no finer detail."""
@@ -368,13 +368,14 @@ class SpatialPhantom:
             spare = (most - least) / 2.0
             low = low + (least - spare).reshape(3, -1)
             high = high + (most + spare).reshape(3, -1)
-        probe = lattice.probe
         # Range is depth for a linear array; beside the middle of a curved one it is more, by at most the lateral distance.
-        beside = np.maximum(np.abs(low[0]), np.abs(high[0])) if probe.shape == "curved" else 0.0
+        beside = np.maximum(np.abs(low[0]), np.abs(high[0])) if lattice.probe.shape == "curved" else 0.0
         sigma = np.sqrt(np.maximum(lattice.slice_variance(low[1]), lattice.slice_variance(high[1] + beside)))
         within = (low[2] < CUT * sigma) & (high[2] > -CUT * sigma)
-        within &= (low[0] < probe.half_width + MARGIN) & (high[0] > -probe.half_width - MARGIN)
-        within &= (high[1] > probe.top - MARGIN) & (low[1] < probe.depth + MARGIN)
+        deepest, outermost = lattice.depths[-1], lattice.lines[-1]
+        u, v = lattice.place(np.array((outermost, outermost)), np.array((0.0, deepest)))
+        within &= (low[0] < u.max()) & (high[0] > -u.max())
+        within &= (high[1] > min(0.0, float(v[0]))) & (low[1] < deepest)
         return np.flatnonzero(within)
 
     def _reflected(
@@ -582,7 +583,9 @@ class _Lattice:
         across = self.spread(self.depths if self.probe.shape == "curved" else np.zeros(1))
         cycles = (self.carrier * sin(look)) * across[:, None] * self.lines
         phase = ((cycles - np.floor(cycles)) * (2.0 * pi)).astype(np.float32)
-        steering: Complexes = np.cos(phase) + np.complex64(1j) * np.sin(phase)
+        # `with_beam` undoes the deposit's triangle at the steered frequencies; these echoes were shared out at the lower ones.
+        triangle = np.sinc((self.carrier * sin(look) * LINE) * across).astype(np.float32) ** 2
+        steering: Complexes = (np.cos(phase) + np.complex64(1j) * np.sin(phase)) * triangle[:, None]
         return steering
 
     def with_pulse(self, echoes: Complexes) -> Complexes:
