@@ -176,8 +176,8 @@ def test_no_scatterer_is_missed_where_tissue_moves_into_the_slice(
     """A needle's push across the plane, against all scatterers of the block."""
 
     def push(p: Floats) -> Floats:
-        near = np.exp(-(((p - (2.0, 20.0, 3.0)) / 3.0) ** 2).sum(axis=1))
-        return np.outer(near, (0.5, 2.0, -5.0))
+        near = np.exp(-(((p - (2.0, 20.0, 8.0)) / 5.0) ** 2).sum(axis=1))
+        return np.outer(near, (0.5, 2.0, -8.0))
 
     for probe in (PROBE, Probe("curved", radius=40.0, opening=40.0, depth=36.0, pixel=0.1, **SLICE)):
         plane = probe_plane((0, 0, 0), 15.0, 8.0)

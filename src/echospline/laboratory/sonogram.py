@@ -288,7 +288,8 @@ class SpatialPhantom:
         lattice = _Lattice.of(probe, self.transducer, looks)
         scattered = lattice.with_pulse(self._scattered(lattice, plane, displacement))
         reflected = lattice.with_pulse(self._reflected(lattice, plane, displacement))
-        trail = lattice.with_trail(reflected * self._transmission(lattice, plane, 0.0, displacement))
+        straight = self._transmission(lattice, plane, 0.0, displacement)
+        trail = lattice.with_trail(reflected * straight)
         noise = None
         if floor > -np.inf:
             rng = np.random.default_rng((noise_seed, 2))
@@ -296,7 +297,7 @@ class SpatialPhantom:
             noise *= np.float32(10.0 ** (floor / 20.0) / sqrt(2.0))
         total = np.zeros(lattice.shape, dtype=np.float32)
         for number, look in enumerate(lattice.looks):
-            share = self._transmission(lattice, plane, look, displacement)
+            share = straight if look == 0.0 else self._transmission(lattice, plane, look, displacement)
             # Each look has its own reverberation and noise; shifting them is as good as drawing them anew.
             through = reflected * share
             through[LAG * number :] += trail[: len(trail) - LAG * number]
@@ -438,7 +439,7 @@ class SpatialPhantom:
         index = (points - a.origin) / np.array(a.spacing)
         found = ndimage.map_coordinates(a.voxels, index.T[::-1], np.float32, order=1, mode="nearest")
         found[above] = 0.0
-        # both ways, dB per step; half a step before a sample lies above it
+        # Both ways, dB. A step's loss is complete at its end: half a step below its sample.
         loss = np.cumsum(found.reshape(u.shape), axis=0) * np.float32(
             2.0 * self.transducer.frequency * dd / 10.0
         )
