@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import ceil, isfinite, log, pi, radians, sin, sqrt, tan
 
 import cv2
@@ -41,7 +42,7 @@ SpatialDisplacement = Callable[[Floats], Floats]
 
 CELL = (0.55, 0.2, 1.0)
 """mm (x, y, z), one scatterer each: about eight in the smallest resolution cell of `ABDOMINAL`; fewer bring the envelope off Rayleigh."""
-BRICK = (6, 16, 4)
+BRICK = (4, 16, 2)
 """Cells (x, y, z) that are stored together, so that a slab is found without testing every scatterer."""
 ABDOMINAL = Transducer(frequency=3.5, bandwidth=0.6, f_number=2.6)
 """3.5 MHz abdominal array."""
@@ -57,6 +58,8 @@ COARSE = (0.75, 0.5)
 """mm (lateral, depth); lattice on which attenuation is summed: shadows have no finer detail."""
 CUT = 2.5
 """Sigmas of the slice beyond which scatterers are left out; fewer make neighbouring planes less alike than their beams are."""
+PIECE = 2**15
+"""Scatterers that are worked on together."""
 MARGIN = 3.0
 """mm beside the picture whose echoes reach into it."""
 SIDE_LOBES, SIDE_LOBE_WIDTH = 0.012, 5.0
@@ -85,12 +88,15 @@ class Scattering:
         Number of bricks; x fastest.
     low : (x, y, z)
         Lowest corner of the block, mm.
+    size : (x, y, z)
+        Of a brick, mm.
     """
 
     points: Singles
     amplitudes: Singles
     bricks: tuple[int, int, int]
     low: tuple[float, float, float]
+    size: tuple[float, float, float]
 
     @classmethod
     def of_levels(
@@ -137,14 +143,8 @@ class Scattering:
             points[axis] += rng.random(sorted_levels.shape, np.float32)
             points[axis] *= np.float32(cell[axis])
             points[axis] += np.float32(low[axis])
-        return cls(points, amplitudes, bricks, (float(low[0]), float(low[1]), float(low[2])))
-
-    @property
-    def size(self) -> Floats:
-        """Extent of one brick along x, y and z, mm, as its cells fill it."""
-        high = self.points.max(axis=(1, 2)).astype(np.float64)
-        size: Floats = (high - self.low) / self.bricks
-        return size
+        x, y, z = (float(c) * b for c, b in zip(cell, BRICK, strict=True))
+        return cls(points, amplitudes, bricks, (float(low[0]), float(low[1]), float(low[2])), (x, y, z))
 
 
 def _bricked(cells: Singles, bricks: tuple[int, int, int]) -> Singles:
@@ -325,18 +325,13 @@ class SpatialPhantom:
         amplitudes = scattering.amplitudes[chosen].reshape(-1)
         if displacement is not None and points.size:
             points = points + _displaced(displacement, points)
-        u, v, e = _in_plane(points, plane)
-        q, d, _ = lattice.beam(u, v)
-        variance = lattice.slice_variance(d)
-        near = np.flatnonzero(e * e < np.float32(CUT**2) * variance)
-        q, d, e, variance = q[near], d[near], e[near], variance[near]
-        row = np.clip((d / np.float32(SAMPLE)).astype(np.int32), 0, lattice.shape[0] - 1)
-        strength = amplitudes[near] * lattice.weight[row]
-        strength *= np.exp(np.float32(-0.5) * e * e / variance) / np.sqrt(np.float32(2 * pi) * variance)
-        turn = d * np.float32(lattice.carrier)
-        turn -= np.floor(turn)
-        turn *= np.float32(-2.0 * pi)
-        return lattice.deposited(q, d, strength * np.cos(turn), strength * np.sin(turn))
+        # Pieces that stay in the processor's cache take a third less time than all at once.
+        pieces = [
+            _slab_echoes(lattice, plane, points[:, k : k + PIECE], amplitudes[k : k + PIECE])
+            for k in range(0, max(1, len(amplitudes)), PIECE)
+        ]
+        q, d, real, imag = (np.concatenate(part) for part in zip(*pieces, strict=True))
+        return lattice.deposited(q, d, real, imag)
 
     def _bricks_of(
         self, lattice: _Lattice, plane: ImagingPlane, displacement: SpatialDisplacement | None
@@ -344,10 +339,10 @@ class SpatialPhantom:
         """Return the bricks that the slab may reach.
 
         Where tissue moves, a brick may lie anywhere between the displacements of its corners and its centre, and half of their
-        difference further: displacement that varies within less than half a brick (1.5 mm) may leave scatterers out.
+        difference further: displacement that varies within half a brick (1 to 1.6 mm) may leave scatterers out.
         """
         s = self.scattering
-        half = s.size / 2.0
+        half = np.array(s.size) / 2.0
         centres = _mesh(
             [low + (np.arange(n) + 0.5) * h for n, h, low in zip(s.bricks, s.size, s.low, strict=True)]
         )
@@ -512,7 +507,7 @@ class _Lattice:
         inside = np.flatnonzero(np.abs(self.lines) <= face / 2 + LINE)
         return slice(inside[0], inside[-1] + 1), ceil(self.probe.depth / SAMPLE) + 1
 
-    @property
+    @cached_property
     def weight(self) -> Singles:
         """Factor that gives scatterers of rms 1, one per cell, speckle of rms 1, for every sample."""
         sz = np.sqrt(self.slice_variance(self.depths))
@@ -566,17 +561,17 @@ class _Lattice:
         last = samples - 1 - round(WRAP / SAMPLE)
         inside = np.flatnonzero((fq >= 0) & (fq < lines - 1) & (fd >= 0) & (fd < last))
         fq, fd, real, imag = fq[inside], fd[inside], real[inside], imag[inside]
-        i, j = fq.astype(np.int32), fd.astype(np.int32)
+        i, j = fq.astype(np.intp), fd.astype(np.intp)
         fq -= i
         fd -= j
-        first = j * np.int32(lines) + i
+        first = j * lines + i
         size = samples * lines
         echoes = np.zeros(size, dtype=np.complex64)
         for down, row_share in ((0, 1 - fd), (1, fd)):
             for right, share in ((0, row_share * (1 - fq)), (1, row_share * fq)):
-                index = first + np.int32(down * lines + right)
-                echoes.real += np.bincount(index, real * share, size)
-                echoes.imag += np.bincount(index, imag * share, size)
+                beyond = down * lines + right
+                echoes.real[beyond:] += np.bincount(first, real * share, size)[: size - beyond]
+                echoes.imag[beyond:] += np.bincount(first, imag * share, size)[: size - beyond]
         return echoes.reshape(self.shape)
 
     def steering(self, look: float) -> Complexes:
@@ -631,6 +626,24 @@ class _Lattice:
         return shaped
 
 
+def _slab_echoes(
+    lattice: _Lattice, plane: ImagingPlane, points: Reals, amplitudes: Singles
+) -> tuple[Reals, Reals, Singles, Singles]:
+    """Return line, range, and real and imaginary part of the echo of the scatterers (3, n) that the slice holds."""
+    u, v, e = _in_plane(points, plane)
+    q, d, _ = lattice.beam(u, v)
+    variance = lattice.slice_variance(d)
+    near = np.flatnonzero(e * e < np.float32(CUT**2) * variance)
+    q, d, e, variance = q[near], d[near], e[near], variance[near]
+    row = np.clip((d * np.float32(1.0 / SAMPLE)).astype(np.int32), 0, lattice.shape[0] - 1)
+    strength = amplitudes[near] * lattice.weight[row]
+    strength *= np.exp(np.float32(-0.5) * e * e / variance) / np.sqrt(np.float32(2 * pi) * variance)
+    turn = d * np.float32(lattice.carrier)
+    turn -= np.floor(turn)
+    turn *= np.float32(-2.0 * pi)
+    return q, d, strength * np.cos(turn), strength * np.sin(turn)
+
+
 def _mesh(axes: Sequence[Floats]) -> Floats:
     """Return coordinates (3, nz, ny, nx) of the lattice with these x, y and z."""
     Z, Y, X = np.meshgrid(*axes[::-1], indexing="ij")
@@ -640,12 +653,8 @@ def _mesh(axes: Sequence[Floats]) -> Floats:
 def _in_plane(points: Reals, plane: ImagingPlane) -> tuple[Reals, Reals, Reals]:
     """Return lateral position, depth and distance (mm) of points (3, n) from the plane, in their own type."""
     m = plane.matrix.astype(points.dtype)
-    x, y, z = points
-    (ox, oy, oz), r = m[:3, 3], m[:3, :3]
-    u, v, e = (
-        x * r[0, i] + y * r[1, i] + z * r[2, i] - (ox * r[0, i] + oy * r[1, i] + oz * r[2, i])
-        for i in range(3)
-    )
+    origin, turn = m[:3, 3], np.ascontiguousarray(m[:3, :3].T)
+    u, v, e = turn @ points - (turn @ origin)[:, None]
     return u, v, e
 
 
