@@ -644,7 +644,7 @@ def _slab_echoes(
     return q, d, strength * np.cos(turn), strength * np.sin(turn)
 
 
-def _mesh(axes: Sequence[Floats]) -> Floats:
+def _mesh(axes: Sequence[Reals]) -> Floats:
     """Return coordinates (3, nz, ny, nx) of the lattice with these x, y and z."""
     Z, Y, X = np.meshgrid(*axes[::-1], indexing="ij")
     return np.stack((X, Y, Z))
