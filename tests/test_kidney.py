@@ -18,6 +18,7 @@ from scipy import ndimage
 from echospline.errors import InputError
 from echospline.laboratory import Kidney, sample_volume
 from echospline.laboratory.anatomy import KidneyAnatomy, lattice
+from echospline.laboratory.beam_lattice import LINE, SAMPLE
 from echospline.laboratory.kidney_recipe import (
     CELL,
     CELLS,
@@ -26,7 +27,6 @@ from echospline.laboratory.kidney_recipe import (
     PROBE,
     TISSUES,
 )
-from echospline.laboratory.sonogram import LINE, SAMPLE
 from echospline.scene import Floats, probe_plane
 
 SAMPLE_MODULE = import_module("echospline.laboratory.kidney")

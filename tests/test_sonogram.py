@@ -10,17 +10,9 @@ import pytest
 from scipy.special import ellipe, ellipk
 
 from echospline.errors import InputError
-from echospline.laboratory.sonogram import (
-    ABDOMINAL,
-    BRICK,
-    CELL,
-    CUT,
-    LINE,
-    SAMPLE,
-    Faces,
-    Scattering,
-    SpatialPhantom,
-)
+from echospline.laboratory.beam_lattice import LINE, SAMPLE
+from echospline.laboratory.scattering import BRICK, CELL, Faces, Scattering
+from echospline.laboratory.sonogram import ABDOMINAL, CUT, SpatialPhantom
 from echospline.scene import Floats, ImagingPlane, Probe, Volume, probe_plane
 
 RAYLEIGH = sqrt(pi / (4.0 - pi))
