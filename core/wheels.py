@@ -69,6 +69,7 @@ def check(path: Path, target: build.Target) -> None:
         library = archive.read(native + target.library)
     wanted = {native + file for file in (target.library, "echospline.wasm", "echospline.js", "__init__.py")}
     wanted |= {"echospline/data/calf.png", "echospline/data/demo.toml", "echospline/viewer/static/index.html"}
+    wanted |= {"echospline/data/spine.mha", "echospline/data/spine.LICENSE"}
     if missing := wanted - names:
         raise build.BuildError(f"{path.name} lacks {', '.join(sorted(missing))}")
     libraries = {

@@ -10,17 +10,9 @@ import pytest
 from scipy.special import ellipe, ellipk
 
 from echospline.errors import InputError
-from echospline.laboratory.sonogram import (
-    ABDOMINAL,
-    BRICK,
-    CELL,
-    CUT,
-    LINE,
-    SAMPLE,
-    Faces,
-    Scattering,
-    SpatialPhantom,
-)
+from echospline.laboratory.beam_lattice import LINE, SAMPLE
+from echospline.laboratory.scattering import BRICK, CELL, Faces, Scattering
+from echospline.laboratory.sonogram import ABDOMINAL, CUT, SpatialPhantom
 from echospline.scene import Floats, ImagingPlane, Probe, Volume, probe_plane
 
 RAYLEIGH = sqrt(pi / (4.0 - pi))
@@ -170,6 +162,26 @@ def test_speckle_decorrelates_across_the_plane_as_the_beam_does(homogeneous: Spa
         assert found == pytest.approx(wanted, abs=0.03)
 
 
+def test_no_scatterer_is_missed_where_tissue_moves_into_the_slice(
+    homogeneous: SpatialPhantom, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A needle's push across the plane, against all scatterers of the block."""
+
+    def push(p: Floats) -> Floats:
+        near = np.exp(-(((p - (2.0, 20.0, 8.0)) / 5.0) ** 2).sum(axis=1))
+        return np.outer(near, (0.5, 2.0, -8.0))
+
+    for probe in (PROBE, Probe("curved", radius=40.0, opening=40.0, depth=36.0, pixel=0.1, **SLICE)):
+        plane = probe_plane((0, 0, 0), 15.0, 8.0)
+        found = single(homogeneous, plane, probe, displacement=push)
+        with monkeypatch.context() as patch:
+            count = homogeneous.scattering.amplitudes.shape[0]
+            patch.setattr(SpatialPhantom, "_bricks_of", lambda *_, n=count: np.arange(n))
+            everything = single(homogeneous, plane, probe, displacement=push)
+        np.testing.assert_allclose(found, everything, atol=1e-5)
+        assert np.abs(everything - single(homogeneous, plane, probe)).max() > 1.0
+
+
 def test_a_strain_moves_speckle_with_the_tissue(homogeneous: SpatialPhantom) -> None:
     plane = probe_plane((0, 0, 0))
     before = single(homogeneous, plane)
@@ -199,6 +211,19 @@ def test_a_face_square_to_the_beam_has_its_level_whatever_the_plane(yaw: float) 
     probe = replace(PROBE, width=20.0)
     envelope = inner(single(phantom(silent, faces=flat_face(20.0, 8.0)), probe_plane((0, 0, 0), yaw), probe))
     np.testing.assert_allclose(envelope.max(axis=0), 10.0, rtol=0.02)
+
+
+@pytest.mark.parametrize(
+    "probe", [PROBE, Probe("curved", radius=40.0, opening=50.0, depth=36.0, pixel=0.1, **SLICE)]
+)
+def test_a_rough_face_is_as_bright_in_a_steered_look(probe: Probe) -> None:
+    block = phantom(np.full(CELLS[::-1], -300.0, np.float32), faces=flat_face(20.0, 0.0))
+    straight, steered = (inner(single(block, probe_plane((0, 0, 0)), probe, look)) for look in (0.0, 8.0))
+    middle = slice(straight.shape[1] // 2 - 8, straight.shape[1] // 2 + 9)  # square to the lines
+    energy = 100.0 * sqrt(pi) * ABDOMINAL.sigma_axial / SAMPLE  # of a pulse of peak 10
+    for envelope in (straight, steered):
+        np.testing.assert_allclose((envelope[:, middle] ** 2).sum(axis=0), energy, rtol=0.06)
+    np.testing.assert_allclose(steered[:, middle], straight[:, middle], atol=0.3)
 
 
 def test_a_slanting_face_is_weaker_by_its_cosine_to_the_power() -> None:

@@ -14,7 +14,8 @@ if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.laboratory.phantom_cine import displacement_of, phantom_pictures
     from echospline.laboratory.rescatter import rescatter
     from echospline.laboratory.sample_volumes import SAMPLE_VOLUMES, sample_volume
-    from echospline.laboratory.sonogram import ABDOMINAL, Faces, Scattering, SpatialPhantom
+    from echospline.laboratory.scattering import Faces, Scattering
+    from echospline.laboratory.sonogram import ABDOMINAL, SpatialPhantom
     from echospline.laboratory.speckle import speckle_statistics
 else:
     on_demand(__name__)

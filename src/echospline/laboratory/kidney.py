@@ -29,12 +29,13 @@ from echospline.laboratory.kidney_recipe import (
     build_tissue,
     build_volume,
 )
-from echospline.laboratory.sonogram import Faces, SpatialPhantom
+from echospline.laboratory.scattering import Faces
+from echospline.laboratory.sonogram import SpatialPhantom
 from echospline.scene import Volume
 
 SEED = 1
 """The patient of ``sample:kidney``."""
-_RECIPE = ("anatomy.py", "kidney_recipe.py", "sonogram.py")
+_RECIPE = ("anatomy.py", "kidney_recipe.py", "scattering.py", "beam_lattice.py", "sonogram.py")
 _FACES = ("points", "amplitudes", "normals", "powers")
 
 

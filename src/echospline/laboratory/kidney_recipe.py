@@ -16,16 +16,9 @@ from scipy import ndimage
 
 from echospline.errors import InputError
 from echospline.laboratory.anatomy import Coordinates, KidneyAnatomy, Singles, SmoothNoise, lattice
-from echospline.laboratory.sonogram import (
-    ABDOMINAL,
-    CELL,
-    DISPLAY,
-    LINE,
-    SAMPLE,
-    Faces,
-    Scattering,
-    SpatialPhantom,
-)
+from echospline.laboratory.beam_lattice import LINE, SAMPLE
+from echospline.laboratory.scattering import CELL, Faces, Scattering
+from echospline.laboratory.sonogram import ABDOMINAL, DISPLAY, SpatialPhantom
 from echospline.scene import Floats, Probe, Volume, probe_plane
 
 
