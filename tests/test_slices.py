@@ -34,16 +34,24 @@ def test_a_slice_is_scipys_interpolation(shape):
     i, j = np.meshgrid(np.arange(0, columns + step, step), np.arange(0, rows + step, step))
     i, j = i[:, : (columns - 2) // step + 2], j[: (rows - 2) // step + 2]
     i, j = i[: j.shape[0]], j[:, : i.shape[1]]
-    places = volume.origin + size * (corner + np.multiply.outer(i / columns, right) + np.multiply.outer(j / rows, down))
+    places = volume.origin + size * (
+        corner + np.multiply.outer(i / columns, right) + np.multiply.outer(j / rows, down)
+    )
     pixels, outside = NativeVolume(volume).slice(places, (columns, rows), step, np.array([0.0, 0.0, 1.0]))
     c, r = np.meshgrid(np.arange(columns), np.arange(rows))
-    exact = volume.origin + size * (corner + np.multiply.outer(c / columns, right) + np.multiply.outer(r / rows, down))
+    exact = volume.origin + size * (
+        corner + np.multiply.outer(c / columns, right) + np.multiply.outer(r / rows, down)
+    )
     index = (exact - volume.origin) / volume.spacing
-    expected = map_coordinates(volume.voxels.astype(float), index.reshape(-1, 3)[:, ::-1].T, order=1, mode="nearest")
+    expected = map_coordinates(
+        volume.voxels.astype(float), index.reshape(-1, 3)[:, ::-1].T, order=1, mode="nearest"
+    )
     inside = volume.contains(exact.reshape(-1, 3))
     assert np.abs(pixels.ravel()[inside] - expected[inside]).max() <= 0.6  # rounded, and single precision
-    edge = np.abs(index.reshape(-1, 3) - np.clip(index.reshape(-1, 3), 0, np.subtract(volume.shape, 1))).max(axis=1)
-    assert outside == pytest.approx((~inside).sum(), abs=(edge[~inside] < 2e-3).sum() + 1)
+    edge = np.abs(index.reshape(-1, 3) - np.clip(index.reshape(-1, 3), 0, np.subtract(volume.shape, 1))).max(
+        axis=1
+    )
+    assert outside == pytest.approx((~inside).sum(), abs=int((edge[~inside] < 2e-3).sum()) + 1)
 
 
 def test_a_thick_slice_is_the_mean_across_its_profile():
@@ -57,9 +65,10 @@ def test_a_thick_slice_is_the_mean_across_its_profile():
     weights = np.exp(-0.5 * (offsets / 1.2) ** 2)
     many = [volume.sample(places.reshape(-1, 3) + z * plane.matrix[:3, 2]) for z in offsets]
     expected = np.tensordot(weights / weights.sum(), many, 1)
-    assert np.abs(thick.ravel() - expected).mean() < 1.5  # three samples stand for the profile
     thin, _ = NativeVolume(volume).slice(places, grid.shape, 1, plane.matrix[:3, 2])
-    assert np.abs(thin.ravel() - expected).mean() > 5.0
+    missed = np.abs(thick.ravel() - expected).mean(), np.abs(thin.ravel() - expected).mean()
+    assert missed[0] < 0.6  # three samples stand for the profile
+    assert missed[0] < missed[1] / 3
 
 
 def test_outside_and_unseen_pixels_are_background():
@@ -111,7 +120,7 @@ def test_the_deformed_picture_shows_undeformed_tissue_where_it_came_from():
     assert drawn.residual < 0.25
     assert drawn.folds is None
     moved = np.abs(drawing.draw(plane).image.pixels.astype(float) - drawn.image.pixels)
-    assert moved.mean() > 3.0
+    assert moved.mean() > 1.0
 
 
 def test_a_fold_is_found_and_placed():
@@ -129,7 +138,16 @@ def test_a_needle_fades_with_its_distance_from_the_plane_as_the_beam_s_profile_d
     volume = Volume(np.zeros((40, 40, 40), np.uint8), (1.0, 1.0, 1.0), (-19.5, 0.0, -19.5))
     probe = Probe(width=30, depth=30, pixel=0.1)
     drawing = SliceDrawing(volume, probe)
-    looks = NeedleEcho(tip=False, tail=False, shadow=False, wobble=0.0, patches=0.0, roughness=-300.0, steering=0.0, specular=-5.0)
+    looks = NeedleEcho(
+        tip=False,
+        tail=False,
+        shadow=False,
+        wobble=0.0,
+        patches=0.0,
+        roughness=-300.0,
+        steering=0.0,
+        specular=-5.0,
+    )
     pose = SpatialPose((-12.0, 18.0, 0.0), (12.0, 18.0, 0.0))
     brightest = []
     distances = np.array([0.0, 0.4, 0.8, 1.2])
@@ -164,8 +182,18 @@ def test_a_needle_across_the_plane_is_a_spot_and_is_lost_beyond_it():
         (lambda: Probe(opening=200.0, shape="curved"), "from 1 to 179"),
         (lambda: random_volume((4, 4, 4)).with_depth("w"), "depth runs along one of"),
         (lambda: random_volume((4, 4, 4)).windowed(3, 3), "from a lower to a higher"),
-        (lambda: NativeVolume(random_volume((9, 9, 9))).slice(np.zeros((2, 2, 3)), (20, 20), 4, np.eye(3)[2]), "lattice must hold"),
-        (lambda: NativeVolume(random_volume((9, 9, 9))).slice(np.full((2, 2, 3), np.nan), (4, 4), 4, np.eye(3)[2]), "numbers in mm"),
+        (
+            lambda: NativeVolume(random_volume((9, 9, 9))).slice(
+                np.zeros((2, 2, 3)), (20, 20), 4, np.eye(3)[2]
+            ),
+            "lattice must hold",
+        ),
+        (
+            lambda: NativeVolume(random_volume((9, 9, 9))).slice(
+                np.full((2, 2, 3), np.nan), (4, 4), 4, np.eye(3)[2]
+            ),
+            "numbers in mm",
+        ),
     ],
 )
 def test_what_makes_no_sense_gets_a_sentence(make, said):
@@ -199,9 +227,15 @@ def test_turning_a_volume_keeps_it_right_handed_and_its_depth_along_y(axis):
 def test_planes_turn_as_hands_do():
     straight = probe_plane((1.0, 0.0, 2.0))
     np.testing.assert_allclose(straight.lift(np.array([[3.0, 4.0]])), [[4.0, 4.0, 2.0]])
-    np.testing.assert_allclose(probe_plane((0, 0, 0), yaw=90).lift(np.array([[1.0, 0.0]])), [[0, 0, -1]], atol=1e-12)
-    np.testing.assert_allclose(probe_plane((0, 0, 0), pitch=90).lift(np.array([[0.0, 1.0]])), [[0, 0, 1]], atol=1e-12)
-    np.testing.assert_allclose(probe_plane((0, 0, 0), roll=90).lift(np.array([[0.0, 1.0]])), [[-1, 0, 0]], atol=1e-12)
+    np.testing.assert_allclose(
+        probe_plane((0, 0, 0), yaw=90).lift(np.array([[1.0, 0.0]])), [[0, 0, -1]], atol=1e-12
+    )
+    np.testing.assert_allclose(
+        probe_plane((0, 0, 0), pitch=90).lift(np.array([[0.0, 1.0]])), [[0, 0, 1]], atol=1e-12
+    )
+    np.testing.assert_allclose(
+        probe_plane((0, 0, 0), roll=90).lift(np.array([[0.0, 1.0]])), [[-1, 0, 0]], atol=1e-12
+    )
     plane = probe_plane((3.0, 1.0, -2.0), 40.0, 20.0, -10.0)
     p = RNG.normal(size=(10, 3))
     np.testing.assert_allclose(plane.lower(plane.lift(p[:, :2]))[:, :2], p[:, :2], atol=1e-12)

@@ -5,7 +5,7 @@
 #include <cstdio>
 #include <cstdlib>
 
-#include "../include/echospline/echospline.h"
+#include "../include/echospline/space.h"
 #include "space_entries.hpp"
 
 struct echospline_volume {

@@ -1,5 +1,6 @@
 // What a level offers for scenes in space. Arguments have been checked: pointers, sizes and finite numbers.
 #pragma once
+#include "../include/echospline/space.h"
 #include "level.hpp"
 
 namespace echospline {

@@ -8,6 +8,7 @@
 #include "array.hpp"
 #include "gathering.hpp"
 #include "sampling.hpp"
+#include "space.h"
 
 namespace echospline::ECHOSPLINE_CORE {
 

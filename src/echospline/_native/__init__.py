@@ -143,14 +143,6 @@ class NeedlePart(IntFlag):
     SHADOW = 8
 
 
-class SpaceTop(IntEnum):
-    """The surface of elastic tissue in space."""
-
-    TOP_NONE = 0
-    TOP_FREE = 1
-    TOP_SLIDING = 2
-
-
 class SceneOptions(ctypes.Structure):
     """echospline_scene_options."""
 
@@ -351,57 +343,6 @@ class NeedleLoad(ctypes.Structure):
     ]
 
 
-class VolumeOptions(ctypes.Structure):
-    """echospline_volume_options."""
-
-    _fields_ = [
-        ("struct_size", c_uint32),
-        ("level", c_int32),
-        ("shape", c_int32 * 3),
-        ("reserved", c_int32),
-        ("spacing", c_double * 3),
-        ("origin", c_double * 3),
-    ]
-
-
-class Slice(ctypes.Structure):
-    """echospline_slice."""
-
-    _fields_ = [
-        ("struct_size", c_uint32),
-        ("columns", c_int32),
-        ("rows", c_int32),
-        ("step", c_int32),
-        ("normal", c_double * 3),
-        ("spread", c_void_p),
-        ("mask", c_void_p),
-        ("background", c_int32),
-        ("reserved", c_int32),
-    ]
-
-
-class ForceField(ctypes.Structure):
-    """echospline_force_field."""
-
-    _fields_ = [
-        ("struct_size", c_uint32),
-        ("level", c_int32),
-        ("top", c_int32),
-        ("reserved", c_int32),
-        ("poisson", c_double),
-        ("shear_modulus", c_double),
-        ("places", c_void_p),
-        ("forces", c_void_p),
-        ("radii", c_void_p),
-        ("force_count", c_int64),
-        ("lattice_shape", c_int32 * 3),
-        ("lattice_reserved", c_int32),
-        ("lattice_spacing", c_double * 3),
-        ("lattice_origin", c_double * 3),
-        ("lattice", c_void_p),
-    ]
-
-
 FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {  # name: result, arguments; handles and arrays are addresses
     "echospline_status_text": (c_char_p, [c_int32]),
     "echospline_version": (c_uint32, []),
@@ -463,14 +404,6 @@ FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {  # name: result, arguments; hand
     "echospline_forced_state_size": (c_int64, [c_void_p]),
     "echospline_forced_state_save": (c_int32, [c_void_p, c_void_p, c_int64]),
     "echospline_forced_state_load": (c_int32, [c_void_p, c_void_p, c_int64]),
-    "echospline_volume_create": (c_int32, [POINTER(VolumeOptions), c_void_p, POINTER(c_void_p)]),
-    "echospline_volume_destroy": (None, [c_void_p]),
-    "echospline_volume_message": (c_char_p, [c_void_p]),
-    "echospline_volume_slice": (
-        c_int32,
-        [c_void_p, POINTER(Slice), c_void_p, c_int64, c_void_p, c_int64, POINTER(c_int64)],
-    ),
-    "echospline_force_field_at": (c_int32, [POINTER(ForceField), c_void_p, c_int64, c_void_p]),
 }
 
 

@@ -62,6 +62,8 @@ def described(model: object) -> str:
     """Return in one sentence how a model solves the tissue; empty where the model's name says it all (landmarks)."""
     describe = getattr(model, "describe", None)
     return str(describe()) if callable(describe) else ""
+
+
 class SpatialTissueModel(Protocol, Generic[State]):
     """Tissue in space that answers a needle; states as in `TissueModel`."""
 

@@ -16,6 +16,7 @@ from typing import Literal
 import numpy as np
 
 from echospline import _native as core
+from echospline._native import space
 from echospline.errors import InputError
 from echospline.mechanics.half_space import Top, gradient, kelvinlet, tractions
 from echospline.mechanics.landmarks import SIDES, Clamps
@@ -25,7 +26,7 @@ from echospline.scene import Floats, SpatialGrid, Tissue, as_points
 
 Kind = Literal["clamped", "sliding", "free"]
 
-TOPS = {None: core.SpaceTop.TOP_NONE, "free": core.SpaceTop.TOP_FREE, "sliding": core.SpaceTop.TOP_SLIDING}
+TOPS = {None: space.SpaceTop.TOP_NONE, "free": space.SpaceTop.TOP_FREE, "sliding": space.SpaceTop.TOP_SLIDING}
 SPACING = 0.19
 """Distance between boundary forces, and of them from the faces, as a share of the edge of a cube as large as the tissue."""
 ROWS = 0.44
@@ -119,7 +120,7 @@ def displacement(
         If the core refuses a number.
     """
     p = np.ascontiguousarray(points, dtype=np.float64)
-    o = core.ForceField(struct_size=ctypes.sizeof(core.ForceField), top=TOPS[top], poisson=poisson)
+    o = space.ForceField(struct_size=ctypes.sizeof(space.ForceField), top=TOPS[top], poisson=poisson)
     o.shear_modulus, o.force_count = shear_modulus(young, poisson), len(f.places)
     arrays = [np.ascontiguousarray(v, dtype=np.float64) for v in (f.places, f.forces, f.radii)]
     o.places, o.forces, o.radii = (v.ctypes.data for v in arrays)
@@ -130,9 +131,9 @@ def displacement(
         o.lattice_shape[:], o.lattice_spacing[:] = values.shape[2::-1], [float(h) for h in smooth.spacing]
         o.lattice_origin[:] = [float(v) for v in smooth.origin]
     u = np.empty_like(p)
-    status = core.library().echospline_force_field_at(ctypes.byref(o), p.ctypes.data, len(p), u.ctypes.data)
+    status = space.library().echospline_force_field_at(ctypes.byref(o), p.ctypes.data, len(p), u.ctypes.data)
     if status != core.Status.OK:
-        text: bytes = core.library().echospline_status_text(status)
+        text: bytes = space.library().echospline_status_text(status)
         raise InputError(
             f"the field of {len(f.places)} forces at {len(p)} points cannot be summed ({text.decode()}): forces lie below the "
             "surface, and every number is finite and below 1e6 mm"

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echospline import _native as core
+from echospline._native import space
 from echospline.errors import InputError
 from echospline.picture.native import NativePicture
 from echospline.picture.needle_echo import NeedleEcho
@@ -115,8 +116,8 @@ class NativeVolume:
             raise InputError(
                 f"a volume is sliced from 8-bit voxels; got {volume.voxels.dtype}: choose a window (Volume.windowed)"
             )
-        self._core = core.library()
-        o = core.VolumeOptions(struct_size=ctypes.sizeof(core.VolumeOptions))
+        self._core = space.library()
+        o = space.VolumeOptions(struct_size=ctypes.sizeof(space.VolumeOptions))
         for k in range(3):
             o.shape[k], o.spacing[k], o.origin[k] = volume.shape[k], volume.spacing[k], volume.origin[k]
         voxels = np.ascontiguousarray(volume.voxels)
@@ -162,7 +163,7 @@ class NativeVolume:
         outside : int
             Shown pixels outside the volume.
         """
-        s = core.Slice(struct_size=ctypes.sizeof(core.Slice), columns=shape[0], rows=shape[1], step=step)
+        s = space.Slice(struct_size=ctypes.sizeof(space.Slice), columns=shape[0], rows=shape[1], step=step)
         s.background = background
         s.normal[:] = [float(v) for v in normal]
         places = np.ascontiguousarray(lattice, dtype=np.float64)
