@@ -60,12 +60,18 @@ def test_misuse_ends_in_a_status():
     handle, options = ctypes.c_void_p(), space.VolumeOptions(struct_size=ctypes.sizeof(space.VolumeOptions))
     voxels = (ctypes.c_uint8 * 8)()
     assert library.echospline_volume_create(None, None, ctypes.byref(handle)) == Status.NULL_POINTER
-    assert library.echospline_volume_create(ctypes.byref(options), voxels, ctypes.byref(handle)) == Status.WRONG_SIZE
+    assert (
+        library.echospline_volume_create(ctypes.byref(options), voxels, ctypes.byref(handle))
+        == Status.WRONG_SIZE
+    )
     assert b"shape of a volume" in library.echospline_volume_message(handle)
     cut = space.Slice(struct_size=ctypes.sizeof(space.Slice), columns=2, rows=2, step=1)
     out = (ctypes.c_uint8 * 4)()
     lattice = (ctypes.c_double * 12)()
-    assert library.echospline_volume_slice(handle, ctypes.byref(cut), lattice, 12, out, 4, None) == Status.FAILED_HANDLE
+    assert (
+        library.echospline_volume_slice(handle, ctypes.byref(cut), lattice, 12, out, 4, None)
+        == Status.FAILED_HANDLE
+    )
     library.echospline_volume_destroy(handle)
     library.echospline_volume_destroy(None)
     options.shape[:], options.spacing[:] = (2, 2, 2), (1.0, 1.0, 1.0)
