@@ -12,7 +12,7 @@ from echospline.mechanics.spatial_landmark_model import IN_SPACE
 from echospline.mechanics.spread import bearable, radius_for
 from echospline.scene import Circle, Layer, Region, SpatialGrid, SpatialInsertion, SpatialPose, Sphere, Tissue
 
-GRID = SpatialGrid.spanning((-20, 0, -15), (20, 35, 15), (11, 10, 9))
+GRID = SpatialGrid.spanning((-20, 0, -15), (20, 35, 15), (21, 18, 16))
 BOX = ("left", "right", "bottom", "front", "back")
 SPHERE = Tissue(10.0, 0.45, [Region(Sphere((6.0, 18.0, 0.0), 5.0), 50.0)])
 MODELS = {
@@ -72,9 +72,12 @@ def test_tissue_follows_the_needle_and_clamped_faces_stay(name, scene):
     assert np.isfinite(u).all()
     assert size(u).max() > 0.3
     assert u[size(u).argmax()] @ axis > 0.9 * size(u).max()
-    # boundary forces hold a face in the mean; where it meets the free surface the stress is singular, and they miss by most
-    assert size(u[beside]).max() < (0.03 if name == "green" else 0.01) * size(u).max()
-    assert size(u[beside]).mean() < 0.003 * size(u).max()
+    # boundary forces hold a face in the mean, and least where it meets the free surface; anchors hold it 4 mm apart, not between
+    greatest, mean = {"green": (0.03, 0.003), "tps": (0.02, 0.002), "elastic": (0.05, 0.006)}.get(
+        name, (0.01, 0.001)
+    )
+    assert size(u[beside]).max() < greatest * size(u).max()
+    assert size(u[beside]).mean() < mean * size(u).max()
 
 
 @every_model

@@ -22,11 +22,11 @@ from echospline.mechanics.reference import Reference
 from echospline.mechanics.tps import anchors_for
 from echospline.scene import Floats, SpatialGrid, SpatialPose, Tissue
 
-IN_SPACE = TPSParameters(anchor_spacing=4.0, contact_spacing=2.0, delta=2.0)
+IN_SPACE = TPSParameters(anchor_spacing=4.0, contact_spacing=2.0)
 """Parameters where none are given: anchors are spread over faces instead of edges, and mesh nodes are further apart than in a picture.
 
-Five faces of 40 x 35 x 30 mm have about 450 anchors 4 mm apart; at the plane's 1.5 mm they would be thousands, and their system is full. A
-reach of one node spacing keeps two or more nodes per spacing in contact with a shaft in any direction."""
+Five faces of 40 x 35 x 30 mm have about 450 anchors 4 mm apart; at the plane's 1.5 mm they would be thousands, and their system is full. Friction
+reaches as far as in the plane, 1.5 mm: about two nodes per 2 mm of shaft; a longer reach would make substeps longer."""
 
 
 class SpatialLandmarkModel:
