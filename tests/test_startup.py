@@ -150,7 +150,7 @@ def test_every_default_is_printed_as_it_is_typed():
         printed = describe(option.key).rpartition("default ")[2]
         if option.read is None or "default " not in describe(option.key) or printed == "none":
             continue
-        value = Scenario()
+        value = Scenario.model_validate({"space": {}})
         for name in option.key.split("."):
             value = getattr(value, name)
         typed = option.read(printed)

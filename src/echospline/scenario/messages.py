@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from pydantic import BaseModel
-from pydantic_core import ErrorDetails
+from pydantic_core import ErrorDetails, PydanticUndefined
 
 
 def describe(root: type[BaseModel], key: str) -> str:
@@ -25,7 +25,7 @@ def describe(root: type[BaseModel], key: str) -> str:
         least = "" if low is None else f"{getattr(low, 'ge', getattr(low, 'gt', None)):g}"
         most = "" if high is None else f"{getattr(high, 'le', getattr(high, 'lt', None)):g}"
         words.append(f"range {least} to {most}" if most else f"from {least}")
-    if field.default is not None and not isinstance(field.default, BaseModel):
+    if not (field.default in (None, PydanticUndefined) or isinstance(field.default, BaseModel)):
         extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
         words.append(f"default {_plain(field.default, str(extra.get('between', ',')))}")
     return "; ".join(w for w in words if w)

@@ -148,7 +148,10 @@ class SpaceSection(Section):
         None, description="values shown as black and white; from least to greatest where voxels need one"
     )
     mesh: SpaceMeshSection = Field(default_factory=SpaceMeshSection)
-    probe: SpaceProbeSection = Field(default_factory=SpaceProbeSection)
+    probe: SpaceProbeSection = Field(
+        default_factory=SpaceProbeSection,
+        description="middle of the probe's face, mm, and how it is turned, degrees",
+    )
     needle: SpaceNeedleSection = Field(default_factory=SpaceNeedleSection)
 
     @model_validator(mode="after")
