@@ -278,8 +278,7 @@ def test_metres_are_suspected_until_a_distance_says_millimetres(name: str, of: f
     far[0, 3], near[0, 3] = 1.1 * of, 0.1
     tracking.put(name, far)
     tracking.put(name, near)  # mm by now
-    assert tracking._heard[name].matrix is not None
-    np.testing.assert_array_equal(tracking._heard[name].matrix, near)
+    np.testing.assert_array_equal(tracking.received.known()[name], near)
     Tracking(GRID, Naming()).put(name, np.eye(4))  # exactly at the origin: a default, not a unit
 
 

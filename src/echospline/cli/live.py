@@ -132,6 +132,11 @@ def live(
     from threadpoolctl import threadpool_limits
 
     scenario, folder = scenario_from(source, changes or {})
+    if scenario_room.is_spatial(scenario):
+        raise InputError(
+            f"the page shows scenes in the plane and {source} is a volume: steer needle and probe from 3D Slicer with "
+            f"echospline link {source}, or write a cine with echospline simulate {source}"
+        )
     scenario, image = scenario.opened(folder, eight_bit=True)
     say([*image.notes, *scenario.label_notes(folder)], "note")
     say(scenario_room.size_doubts(image.grid))

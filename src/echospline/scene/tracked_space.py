@@ -1,0 +1,68 @@
+"""A tracked needle in a scene in space: from a frame at its tip to entry and tip, and back; x lateral, y depth, z elevation, mm."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from echospline.scene.grid import Floats
+from echospline.scene.imaging_plane import Reach, TrackedNeedle
+from echospline.scene.space import SpatialPose, as_triple
+
+STEEP = 0.05
+"""Least share of the direction that points into depth for a needle above the skin to aim at a point of it (3 degrees)."""
+
+
+def pose_in_space(
+    needle: TrackedNeedle, low: Floats, high: Floats, reach: Reach, skin: float = 0.0
+) -> SpatialPose | None:
+    """Return entry and tip of a tracked needle: it enters where its axis crosses the skin.
+
+    A needle above the skin has depth 0 and lies at the point that it aims at. None when the tip is farther than ``reach.contact`` from the
+    volume, so that it touches nothing of it.
+
+    Parameters
+    ----------
+    needle : TrackedNeedle
+        Tip and direction of insertion in the scene's frame.
+    low, high : ndarray, shape (3,)
+        Corners of the volume, mm.
+    reach : Reach
+        Its contact, and the length of the shaft.
+    skin : float
+        Depth of the surface, mm.
+    """
+    tip, direction = np.array(needle.tip), np.array(needle.direction)
+    near = np.array([low[0], -np.inf, low[2]]) - reach.contact
+    if (tip < near).any() or (tip > high + reach.contact).any():
+        return None
+    if tip[1] <= skin:
+        aim = tip + (skin - tip[1]) / direction[1] * direction if direction[1] > STEEP else tip
+        at = np.clip(aim, low - reach.contact, high + reach.contact)
+        at[1] = skin
+        return SpatialPose(as_triple(at, "entry"), as_triple(at, "tip"))
+    back = min((tip[1] - skin) / direction[1], reach.shaft) if direction[1] > 0 else reach.shaft
+    return SpatialPose(as_triple(tip - back * direction, "entry"), as_triple(tip, "tip"))
+
+
+def tip_frame(pose: SpatialPose) -> Floats:
+    """Return the 4 x 4 matrix from a frame at a needle's tip to the scene: +Z inserts, +Y lies as near to the scene's z as it can.
+
+    A needle without a direction (zero length) inserts along y.
+    """
+    z = np.array(pose.axis) if any(pose.axis) else np.array([0.0, 1.0, 0.0])
+    up = np.array([0.0, 0.0, 1.0]) if abs(z[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
+    y = up - (up @ z) * z
+    y /= np.linalg.norm(y)
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.column_stack((np.cross(y, z), y, z))
+    matrix[:3, 3] = pose.tip
+    return matrix
+
+
+def nearest_rigid(matrix: Floats) -> Floats:
+    """Return the motion nearest to a 4 x 4 matrix whose axes a tracker has rounded: same translation, nearest rotation."""
+    u, _, v = np.linalg.svd(matrix[:3, :3])
+    rigid = np.eye(4)
+    rigid[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
+    rigid[:3, 3] = matrix[:3, 3]
+    return rigid
