@@ -8,6 +8,7 @@ import numpy as np
 
 from echospline.live.snapshot import Command
 from echospline.mechanics.motion import follow as towards
+from echospline.mechanics.motion import follow_in_space as towards_in_space
 from echospline.mechanics.protocol import SpatialTissueModel, TissueModel
 from echospline.scene import NeedlePose, SpatialPose
 
@@ -42,6 +43,13 @@ def follow(pose: NeedlePose, command: Command, dt: float, lag: float, fastest: f
         If a number is out of its range or not finite.
     """
     return towards(pose, command.entry, command.tip, dt, lag, fastest)
+
+
+def follow_in_space(
+    pose: SpatialPose, command: SpatialPose, dt: float, lag: float, fastest: float
+) -> SpatialPose:
+    """Move a needle in space towards its command; as `follow`."""
+    return towards_in_space(pose, command.entry, command.tip, dt, lag, fastest)
 
 
 def insert_straight(

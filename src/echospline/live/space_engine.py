@@ -17,9 +17,8 @@ from typing import Any
 import numpy as np
 
 from echospline.errors import InputError
-from echospline.live.motion import insert_straight_in_space
+from echospline.live.motion import follow_in_space, insert_straight_in_space
 from echospline.live.slot import Slot
-from echospline.mechanics.motion import follow_in_space
 from echospline.mechanics.protocol import SpatialTissueModel
 from echospline.picture import NeedleEcho
 from echospline.picture.slices import SliceDrawing, SliceDrawn
@@ -82,7 +81,7 @@ class SpatialSnapshot:
 class _Requests:
     """Requests since the last step, the newest of each kind."""
 
-    command: tuple[Triple, Triple] | None = None
+    command: SpatialPose | None = None
     place: SpatialPose | None = None
     plane: ImagingPlane | None = None
     reset: bool = False
@@ -160,7 +159,7 @@ class SpatialEngine:
         self._name, self._model = name, models(name)
         self._state: Any = self._model.rest()
         self._pose, self._plane = replace(home, speed=0.0), plane
-        self._command = home.entry, home.tip
+        self._command = home
         self._path: tuple[SpatialInsertion, PlanePath | None] | None = None
         self._played = 0.0
         self._time, self._steps, self._stepped = 0.0, 0, clock()
@@ -183,7 +182,7 @@ class SpatialEngine:
         """
         pose = SpatialPose(entry, tip)
         with self._lock:
-            self._requests.command = pose.entry, pose.tip
+            self._requests.command = pose
 
     def place(self, entry: Triple, tip: Triple) -> None:
         """Put the needle here as if it had gone straight to this pose, mm: for one that is already inserted when tracking begins.
@@ -195,7 +194,7 @@ class SpatialEngine:
         """
         pose = SpatialPose(entry, tip)
         with self._lock:
-            self._requests.place, self._requests.command = pose, (pose.entry, pose.tip)
+            self._requests.place = self._requests.command = pose
 
     def move_probe(self, plane: ImagingPlane) -> None:
         """Put the probe here: its matrix takes the picture's frame to the scene's, mm; the newest plane wins."""
@@ -259,7 +258,8 @@ class SpatialEngine:
         if self._path is not None or now.plane is not last.plane or now.failure != last.failure:
             return False
         moved = np.abs(np.subtract([before.entry, before.tip], [now.pose.entry, now.pose.tip])).max()
-        gap = np.abs(np.subtract(self._command, [now.pose.entry, now.pose.tip])).max()
+        goal = self._command
+        gap = np.abs(np.subtract([goal.entry, goal.tip], [now.pose.entry, now.pose.tip])).max()
         tissue = np.abs(now.drawn.lattice - last.drawn.lattice).max()
         return bool(self._frozen or (moved < ARRIVED and gap < ARRIVED and tissue < STILL))
 
@@ -287,7 +287,7 @@ class SpatialEngine:
 
     def _go_home(self) -> None:
         self._pose = replace(self.home, speed=0.0)
-        self._command = self.home.entry, self.home.tip
+        self._command = self.home
         self._state = self._model.rest()
         self._time, self._played, self._path, self._failure = 0.0, 0.0, None, None
 
@@ -297,14 +297,14 @@ class SpatialEngine:
             self._played += dt
             first = float(insertion.times[0])
             pose = insertion.pose(first + self._played)
-            self._command = pose.entry, pose.tip
+            self._command = pose
             if planes is not None:
                 self._plane = planes.at(first + self._played)
             longest = max(insertion.times[-1], -np.inf if planes is None else planes.times[-1])
             if self._played >= float(longest) - first:
                 self._path = None
         else:
-            pose = follow_in_space(self._pose, *self._command, dt, self._lag, self._fastest)
+            pose = follow_in_space(self._pose, self._command, dt, self._lag, self._fastest)
         self._state = self._model.advance(self._state, pose, dt)
         self._pose = pose
         self._time += dt
