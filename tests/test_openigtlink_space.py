@@ -33,13 +33,14 @@ from echospline.openigtlink import (
 )
 from echospline.openigtlink.image import Image
 from echospline.openigtlink.tools import Tool, TrackingData
-from echospline.openigtlink.tracking_space import SpatialTracking, plane_of
+from echospline.openigtlink.tracking_space import SpatialTracking
 from echospline.scene import (
     AXIAL,
     ImagingPlane,
     SpatialInsertion,
     SpatialPose,
     Volume,
+    picture_plane,
     probe_plane,
     tip_frame,
 )
@@ -177,9 +178,9 @@ def test_a_calibration_for_another_picture_is_refused_before_it_is_used():
     skewed = PICTURE.copy()
     skewed[0, 1] = 0.05
     with pytest.raises(InputError, match="perpendicular"):
-        plane_of(skewed / np.array([1, np.hypot(0.25, 0.05) / 0.25, 1, 1]), PIXELS)
+        picture_plane(skewed / np.array([1, np.hypot(0.25, 0.05) / 0.25, 1, 1]), PIXELS)
     with pytest.raises(InputError, match="a length"):
-        plane_of(np.zeros((4, 4)), PIXELS)
+        picture_plane(np.zeros((4, 4)), PIXELS)
 
 
 def moved(x: float) -> np.ndarray:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from echospline.errors import InputError
-from echospline.openigtlink.transforms import RIGID, Naming, Received, rigid_fault
+from echospline.openigtlink.transforms import Naming, Received, rigid_fault
 from echospline.scene import (
     Floats,
     ImagingPlane,
@@ -17,6 +17,7 @@ from echospline.scene import (
     chain_between,
     frames_of,
     nearest_rigid,
+    picture_plane,
 )
 
 _AT_THE_TIP = ImagingPlane(np.eye(4))
@@ -95,9 +96,11 @@ class SpatialTracking:
         calibrated = chain_between(naming.calibration, naming.image, naming.probe)
         if calibrated is not None:
             try:
-                self.picture_to_probe = plane_of(calibrated[0], grid).matrix
+                self.picture_to_probe = picture_plane(calibrated[0], grid).matrix
             except InputError as error:
-                raise InputError(f"calibration {' * '.join(calibrated[1])}: {error}") from None
+                raise InputError(
+                    f"calibration {' * '.join(calibrated[1])}: {error} (space.probe.pixel)"
+                ) from None
 
     def put(self, name: str, matrix: Floats, status: str = "", now: float = 0.0) -> None:
         """Store a transform; see `Received.put`."""
@@ -166,7 +169,7 @@ class SpatialTracking:
         matrix, chain = found
         wrong = self.received.fault(chain, now)
         try:
-            plane = plane_of(matrix, self.grid)
+            plane = picture_plane(matrix, self.grid)
         except InputError as error:
             return True, wrong if wrong[0] else ("Refused", chain[0], str(error))
         if not wrong[0] or self._plane is None:
@@ -193,33 +196,3 @@ class SpatialTracking:
             missing = f"no transform leads from {' or '.join(n.needles)} to {n.reference}; there are {there}"
             return False, ("Transforms", "", missing)
         return False, _FINE
-
-
-def plane_of(matrix: Floats, grid: RegularGrid) -> ImagingPlane:
-    """Return the plane of a picture by the matrix from its pixels to the scene, whose axes may be rounded.
-
-    Raises
-    ------
-    InputError
-        If the axes have another spacing than the picture (beyond 1 %), or are not perpendicular (beyond `RIGID`).
-    """
-    lengths = np.linalg.norm(matrix[:3, :2], axis=0)
-    if lengths.min() >= 1e-9 and not np.allclose(lengths, grid.spacing, rtol=0.01):
-        raise InputError(
-            f"expected the picture's {grid.spacing[0]:.4g} x {grid.spacing[1]:.4g} mm per pixel (space.probe.pixel); got "
-            f"{lengths[0]:.4g} x {lengths[1]:.4g}: calibrate for this picture, or give the probe that pixel"
-        )
-    if lengths.min() < 1e-9:
-        raise InputError(
-            "a picture's transform has columns and rows of a length; got 0: the probe is probably not seen"
-        )
-    x, y = (matrix[:3, :2] / lengths).T
-    if abs(float(x @ y)) > RIGID:
-        raise InputError(
-            "a picture's transform has perpendicular columns and rows: a calibration has no skew"
-        )
-    turned = matrix.copy()
-    turned[:3, :3] = np.column_stack((x, y, np.cross(x, y)))
-    turned = nearest_rigid(turned)
-    turned[:3, :2] *= lengths
-    return ImagingPlane.of_image(turned, grid)

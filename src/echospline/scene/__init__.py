@@ -26,7 +26,13 @@ if TYPE_CHECKING:  # the menu, loaded on demand
         Tissue,
         VolumeLabel,
     )
-    from echospline.scene.tracked_space import nearest_rigid, pose_in_space, tip_frame
+    from echospline.scene.tracked_space import (
+        nearest_rigid,
+        picture_plane,
+        pose_in_space,
+        probe_angles,
+        tip_frame,
+    )
     from echospline.scene.transducer import FWHM, TRANSDUCERS, Transducer
     from echospline.scene.transform import as_transform, chain_between, frames_of, transform_between
     from echospline.scene.volume import Volume, Voxels
@@ -83,7 +89,9 @@ __all__ = [
     "frames_of",
     "is_number",
     "nearest_rigid",
+    "picture_plane",
     "pose_in_space",
+    "probe_angles",
     "probe_plane",
     "shades",
     "tip_frame",

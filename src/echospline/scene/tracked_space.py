@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from echospline.scene.grid import Floats
-from echospline.scene.imaging_plane import Reach, TrackedNeedle
+from echospline.errors import InputError
+from echospline.scene.grid import Floats, RegularGrid
+from echospline.scene.imaging_plane import ImagingPlane, Reach, TrackedNeedle
 from echospline.scene.space import SpatialPose, as_triple
 
+RIGID = 0.02
+"""Cosine of the angle between columns and rows up to which it is rounding (1.1 degrees)."""
 STEEP = 0.05
 """Least share of the direction that points into depth for a needle above the skin to aim at a point of it (3 degrees)."""
 
@@ -66,3 +69,43 @@ def nearest_rigid(matrix: Floats) -> Floats:
     rigid[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
     rigid[:3, 3] = matrix[:3, 3]
     return rigid
+
+
+def picture_plane(matrix: Floats, grid: RegularGrid) -> ImagingPlane:
+    """Return the plane of a picture by the matrix from its pixels to the scene, whose axes may be rounded.
+
+    Raises
+    ------
+    InputError
+        If the axes have another spacing than the picture (beyond 1 %), or are not perpendicular (beyond `RIGID`).
+    """
+    lengths = np.linalg.norm(matrix[:3, :2], axis=0)
+    if lengths.min() >= 1e-9 and not np.allclose(lengths, grid.spacing, rtol=0.01):
+        raise InputError(
+            f"expected the picture's {grid.spacing[0]:.4g} x {grid.spacing[1]:.4g} mm per pixel; got "
+            f"{lengths[0]:.4g} x {lengths[1]:.4g}: calibrate for this picture, or give it that spacing"
+        )
+    if lengths.min() < 1e-9:
+        raise InputError(
+            "a picture's transform has columns and rows of a length; got 0: the probe is probably not seen"
+        )
+    x, y = (matrix[:3, :2] / lengths).T
+    if abs(float(x @ y)) > RIGID:
+        raise InputError(
+            "a picture's transform has perpendicular columns and rows: a calibration has no skew"
+        )
+    turned = matrix.copy()
+    turned[:3, :3] = np.column_stack((x, y, np.cross(x, y)))
+    turned = nearest_rigid(turned)
+    turned[:3, :2] *= lengths
+    return ImagingPlane.of_image(turned, grid)
+
+
+def probe_angles(plane: ImagingPlane) -> tuple[float, float, float]:
+    """Return yaw, pitch and roll in degrees with which `probe_plane` turns a probe as this plane's; roll is 0 where it is no other than yaw."""
+    r = plane.matrix[:3, :3]
+    pitch = float(np.degrees(np.arcsin(np.clip(-r[1, 2], -1.0, 1.0))))
+    if abs(r[1, 2]) > 1.0 - 1e-12:  # the beam lies along z: yaw and roll turn about the same axis
+        return float(np.degrees(np.arctan2(-r[2, 0], r[0, 0]))), pitch, 0.0
+    yaw, roll = np.arctan2(r[0, 2], r[2, 2]), np.arctan2(r[1, 0], r[1, 1])
+    return float(np.degrees(yaw)), pitch, float(np.degrees(roll))

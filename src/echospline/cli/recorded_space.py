@@ -1,0 +1,168 @@
+"""``echospline recorded --volume``: a tracked procedure replayed in a volume, and compared with its pictures."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from echospline import openigtlink
+from echospline import scenario as scenario_room
+from echospline.atomic import claimed
+from echospline.cli.link import axis_of
+from echospline.cli.link_space import place_of
+from echospline.cli.options import say, scenario_from
+from echospline.cli.recorded import correlation, write_table
+from echospline.errors import InputError
+from echospline.scene import Floats, Pixels, Probe, RegularGrid, probe_angles
+
+MOVED = "the recording moves probe and needle: leave it out"
+
+
+def recorded_in_volume(
+    file: Path,
+    volume: str,
+    out: Path,
+    changes: dict[str, Any],
+    *,
+    place: str,
+    reference: str,
+    face: str | None,
+    needle_frame: str,
+    needle_axis: str,
+    config: Path | None,
+    as_json: bool,
+) -> None:
+    """Replay a recording in a volume; see the options of `recorded`.
+
+    Raises
+    ------
+    InputError
+        If the volume is none, the recording does not lead to it, or an option says what the recording says.
+    """
+    # they load SimpleITK
+    from echospline.io.sequence import read_sequence
+    from echospline.io.sequence_space import face_grid, paths_in_scene
+    from echospline.picture.simulate_space import SpatialFrame
+    from echospline.scenario.run_space import run_space
+    from echospline.scenario.space_models import build_spatial_model
+
+    spacing = changes.pop("image.spacing", None)
+    for key in changes:
+        if key == "output.fps" or key.startswith(("space.probe", "space.needle")):
+            raise InputError(f"{key} has no meaning here, because {MOVED}")
+    scenario, folder = scenario_from(volume, changes)
+    opened = scenario_room.open_spatial(scenario, folder)
+    scenario, space = opened.scenario, opened.scenario.space
+    assert space is not None  # opened scenes have it
+    calibration = openigtlink.read_calibration(config) if config else {}
+    sequence = read_sequence(file)
+    if sequence.frames.ndim == 4:
+        raise InputError(f"{file} is in colour; a volume gives grey pictures: convert it to grey")
+    grid = face_grid(sequence, _pair(face, "--face"), _pair(spacing, "--spacing"), calibration)
+    low = np.array(opened.volume.origin)
+    paths = paths_in_scene(
+        sequence,
+        grid,
+        place_of(scenario, folder, opened.volume, place),
+        (low, low + np.array(opened.volume.size)),
+        needle=needle_frame,
+        reference=reference,
+        axis=axis_of(needle_axis),
+        calibration=calibration,
+    )
+    say([*opened.notes, *paths.notes], "note")
+    probe = space.probe
+    if not {"shape", "width", "depth", "pixel"} & probe.model_fields_set:
+        probe = probe.model_copy(update=picture_of(grid))
+    rows = [
+        (float(t), *(float(v) for v in plane.matrix[:3, 3]), *probe_angles(plane))
+        for t, plane in zip(paths.planes.times, paths.planes.planes, strict=True)
+    ]
+    i = paths.insertion
+    needle = [tuple(float(v) for v in row) for row in np.column_stack((i.times, i.entry, i.tip))]
+    space = space.model_copy(
+        update={
+            "probe": probe.model_copy(update={"path": rows, "view": None}),
+            "needle": space.needle.model_copy(update={"path": needle}),
+        }
+    )
+    output = scenario.output.model_copy(update={"fps": paths.fps})
+    scenario = scenario.model_copy(update={"space": space, "output": output})
+    model = build_spatial_model(scenario, space.grid(opened.volume), opened.tissue)
+    shape = space.probe.probe()
+    table: list[dict[str, float]] = []
+    first = recorded_at(sequence.frames[paths.pictures[0]], grid, shape)
+
+    def compare(frame: SpatialFrame) -> None:
+        seen = recorded_at(sequence.frames[paths.pictures[frame.index]], grid, shape)
+        drawn = frame.image.pixels
+        both = (seen > 0) & (drawn > 0) & shape.mask
+        x, y, z = frame.plane.matrix[:3, 3]
+        table.append(
+            {
+                "time_s": float(paths.times[frame.index]),
+                "probe_x_mm": float(x), "probe_y_mm": float(y), "probe_z_mm": float(z),
+                "tip_x_mm": frame.pose.tip[0], "tip_y_mm": frame.pose.tip[1], "tip_z_mm": frame.pose.tip[2],
+                "depth_mm": frame.pose.depth,
+                "tip_from_plane_mm": frame.pose.seen_from(frame.plane)[1][2],
+                "outside_share": frame.outside,
+                "compared_share": float(both.sum() / max(int(shape.mask.sum()), 1)),
+                "correlation_simulated": correlation(drawn[both], seen[both]) if both.any() else 0.0,
+                "correlation_still": correlation(first[both], seen[both]) if both.any() else 0.0,
+            }
+        )  # fmt: skip
+
+    with claimed(out):
+        report = run_space(scenario, opened.volume, model, out, folder, watch=compare, doubts=paths.notes)
+        write_table(out / "comparison.csv", table)
+    say(doubt for doubt in report["doubts"] if doubt not in paths.notes)
+    told = {
+        "recording": file.name,
+        "frames": len(table),
+        "duration_s": float(paths.times[-1]),
+        "deepest_mm": max(row["depth_mm"] for row in table),
+        "median_correlation_simulated": float(np.median([row["correlation_simulated"] for row in table])),
+        "median_correlation_still": float(np.median([row["correlation_still"] for row in table])),
+        "results": str(out),
+    }
+    if as_json:
+        print(json.dumps(told, indent=2))
+        return
+    print(
+        f"{told['frames']} frames in {told['duration_s']:.1f} s, needle down to {told['deepest_mm']:.1f} mm; median correlation with what "
+        f"was seen, where both show something: simulated {told['median_correlation_simulated']:.3f}, first frame "
+        f"{told['median_correlation_still']:.3f}\nresults in {out}: {', '.join(report['files'])}, comparison.csv"
+    )
+
+
+def picture_of(grid: RegularGrid) -> dict[str, Any]:
+    """Return shape and size of a linear probe whose picture covers a recorded one from the probe's face down, as keys of [space.probe]."""
+    x0, x1, _, bottom = grid.extent
+    return {
+        "shape": "linear",
+        "width": 2.0 * max(-x0, x1),
+        "depth": bottom,
+        "pixel": min(grid.spacing),
+    }
+
+
+def recorded_at(pixels: Pixels, grid: RegularGrid, probe: Probe) -> Floats:
+    """Interpolate a recorded picture at the pixels of a probe, shape (rows, columns); 0 beyond it."""
+    from scipy.ndimage import map_coordinates
+
+    at = (probe.grid.nodes - np.array(grid.origin)) / np.array(grid.spacing)
+    found: Floats = map_coordinates(pixels.astype(np.float64), [at[:, 1], at[:, 0]], order=1, cval=0.0)
+    return found.reshape(probe.grid.shape[::-1])
+
+
+def _pair(text: str | None, flag: str) -> tuple[float, float] | None:
+    if text is None:
+        return None
+    try:
+        first, second = (float(part) for part in text.split(","))
+    except ValueError:
+        raise InputError(f"{flag} expects two numbers A,B; got {text!r}") from None
+    return first, second
