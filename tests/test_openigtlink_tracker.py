@@ -32,8 +32,8 @@ from echospline.openigtlink import (
 from echospline.openigtlink.message import Request
 from echospline.openigtlink.pose import QuaternionTransform, quaternion_of
 from echospline.openigtlink.tools import QuaternionTrackingData, StartTracking, Tool, TrackingData
-from echospline.openigtlink.transforms import Tracking, is_valid, rigid_fault
-from echospline.scene import TrackedNeedle
+from echospline.openigtlink.transforms import Tracking, is_valid
+from echospline.scene import TrackedNeedle, rigid_fault
 from test_openigtlink_peers import example, free_port, peer, run, start, until
 from test_openigtlink_session import GRID, PLANE, Console, make_stage, pose_at
 

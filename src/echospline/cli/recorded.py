@@ -78,7 +78,8 @@ def recorded(
     the simulated one, and with the first frame (the result without a simulation).
 
     With --volume the tracked probe moves through the volume as well, and the files are those of `simulate` (cine,
-    `displacement.npz` with the plane of every frame, `scenario.toml` ...) and `comparison.csv`.
+    `displacement.npz` with the plane of every frame, `scenario.toml` ...) and `comparison.csv`. The picture is as large as the
+    recorded one, unless the scenario has a probe.
     """
     if volume is not None:
         from echospline.cli.recorded_space import recorded_in_volume

@@ -22,11 +22,14 @@ from echospline.scene import (
     nearest_rigid,
     picture_plane,
     pose_in_space,
-    transform_between,
+    rigid_fault,
 )
 from echospline.scene.space import as_triple
 
 SCENE = "Scene"
+SKEWED = 0.1
+"""Cosine of the angle between columns and rows that a recording's calibration may have (5.7 degrees): one that was fitted without the
+condition of right angles has some (the spine sweep of PLUS 2.8 degrees), and here pixels are put where it says."""
 UNEVEN = 0.5
 """Deviation of a picture's time from an even rate, in pictures, from which it is said."""
 
@@ -43,6 +46,8 @@ class SpatialRecording:
         Of the needle; of depth 0 throughout where the recording has none.
     pictures : ndarray of int, shape (n,)
         Which picture of the sequence each of the n is.
+    pixels : ndarray, shape (2, 2)
+        Shift in the probe's plane from one column, and from one row, to the next, mm, in its columns: diagonal where the calibration has no skew.
     times : ndarray, shape (n,)
         When they were recorded, s from the first.
     fps : float
@@ -54,6 +59,7 @@ class SpatialRecording:
     planes: PlanePath
     insertion: SpatialInsertion
     pictures: np.ndarray[tuple[int, ...], np.dtype[np.intp]]
+    pixels: Floats
     times: Floats
     fps: float
     notes: tuple[str, ...]
@@ -136,30 +142,32 @@ def paths_in_scene(
     Raises
     ------
     InputError
-        If no chain of transforms leads from the picture to the scene in two pictures or more.
+        If no chain of transforms leads from the picture to the scene in two pictures or more, or one of its transforms is none that a rigid
+        tool can have.
     """
     fixed = dict(calibration or {})
     good = np.flatnonzero(sequence.valid)
     found: dict[int, ImagingPlane] = {}
     poses: dict[int, SpatialPose] = {}
-    wrong = ""
+    pixels = np.eye(2)
+    upward = 0
     for i in good:
         known = {**fixed, **sequence.known(int(i))}
         if not any(SCENE in frames_of(name) for name in known):
             known[f"{SCENE}To{reference}"] = place
-        chain = chain_between(known, IMAGE, SCENE)
-        if chain is not None:
-            try:
-                found[int(i)] = picture_plane(chain[0], grid)
-            except InputError as error:
-                wrong = wrong or f" ({' * '.join(chain[1])}: {error})"
-        pose = _needle_pose(known, needle, axis, box, reach or Reach())
+        picture = _chained(known, IMAGE, SCENE, f"{sequence.source}, picture {i}")
+        if picture is not None:
+            plane = picture_plane(picture, grid, SKEWED)
+            pixels = plane.matrix[:3, :2].T @ picture[:3, :2]
+            found[int(i)] = plane
+            upward += bool(plane.matrix[1, 1] < 0)
+        pose = _needle_pose(known, needle, axis, box, reach or Reach(), f"{sequence.source}, picture {i}")
         if pose is not None:
             poses[int(i)] = pose
     if len(found) < 2:
         raise InputError(
             f"{sequence.source or 'the sequence'} has the place of its picture in {len(found)} of {len(good)} good pictures; it takes "
-            f"two{wrong}: a chain of transforms must lead from {IMAGE} to {reference}, and there are "
+            f"two: a chain of transforms must lead from {IMAGE} to {reference}, and there are "
             f"{', '.join(sorted({*sequence.transforms, *fixed})) or 'none'}: give --config FILE.xml with ImageToProbe, or another "
             "--reference"
         )
@@ -175,6 +183,10 @@ def paths_in_scene(
     notes = []
     if len(tracked) < len(pictures):
         notes.append(f"the probe is bridged in {len(pictures) - len(tracked)} of {len(pictures)} pictures")
+    if upward > len(found) / 2:
+        notes.append(
+            "the probe's beam points out of the skin in most pictures: say where the skin lies (--depth-axis), or where the volume stands (--place)"
+        )
     seen = [i for i in poses if i in at]
     if not seen:
         notes.append(
@@ -187,7 +199,27 @@ def paths_in_scene(
         notes.append(
             f"pictures are played evenly at {fps:.3g} per second; the recorded times differ by up to {off / fps:.2g} s"
         )
-    return SpatialRecording(planes, _path(poses, seen, at, box), pictures, times, fps, tuple(notes))
+    return SpatialRecording(planes, _path(poses, seen, at, box), pictures, pixels, times, fps, tuple(notes))
+
+
+def _chained(known: Mapping[str, Floats], start: str, end: str, where: str) -> Floats | None:
+    """Return the product of the transforms that lead from one frame to another; None where none do, or a tool on the way was not seen.
+
+    Raises
+    ------
+    InputError
+        If one of them, other than the picture's calibration, is none that a rigid tool can have.
+    """
+    found = chain_between(known, start, end)
+    if found is None:
+        return None
+    for name in found[1]:
+        kind, reason = rigid_fault(known[name]) if IMAGE not in frames_of(name) else ("", "")
+        if kind == "empty":  # the zeros of a tracker that does not see the tool
+            return None
+        if kind:
+            raise InputError(f"{where}, {name}: {reason}")
+    return found[0]
 
 
 def _needle_pose(
@@ -196,9 +228,10 @@ def _needle_pose(
     axis: tuple[float, float, float],
     box: tuple[Floats, Floats],
     reach: Reach,
+    where: str,
 ) -> SpatialPose | None:
     """Return the needle's pose; of depth 0 where it is far from the volume, None where it is not tracked."""
-    tip = transform_between(known, needle, SCENE)
+    tip = _chained(known, needle, SCENE, where)
     if tip is None:
         return None
     tracked = ImagingPlane(np.eye(4)).see(nearest_rigid(tip), axis)
@@ -206,7 +239,7 @@ def _needle_pose(
     if pose is None:
         at = as_triple(np.clip(tracked.tip, *box) * [1.0, 0.0, 1.0], "entry")
         return SpatialPose(at, at)
-    entry = transform_between(known, ENTRY, SCENE) if needle == NEEDLE else None
+    entry = _chained(known, ENTRY, SCENE, where) if needle == NEEDLE else None
     if entry is not None and pose.depth > 0:
         return SpatialPose(as_triple(entry[:3, 3], "entry"), pose.tip)
     return pose

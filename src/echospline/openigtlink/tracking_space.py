@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from echospline.errors import InputError
-from echospline.openigtlink.transforms import Naming, Received, rigid_fault
+from echospline.openigtlink.transforms import Naming, Received
 from echospline.scene import (
     Floats,
     ImagingPlane,
@@ -18,6 +18,7 @@ from echospline.scene import (
     frames_of,
     nearest_rigid,
     picture_plane,
+    rigid_fault,
 )
 
 _AT_THE_TIP = ImagingPlane(np.eye(4))

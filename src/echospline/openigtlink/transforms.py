@@ -19,13 +19,12 @@ from echospline.scene import (
     as_transform,
     chain_between,
     frames_of,
+    rigid_fault,
     transform_between,
 )
 
 MOST = 100
 """Transforms stored at most; a tracker has a dozen."""
-RIGID = 0.02
-"""Deviation of axes from length 1 and from right angles (1.1 degrees); trackers round to four digits, scales are gross."""
 FARTHEST = 1e4
 """mm; no tracker sees a tool at 10 m."""
 _STAYS = "the needle stays where it was"
@@ -313,23 +312,3 @@ def is_valid(status: str) -> bool:
     """Test whether a tracker's status lets its transform be used: OK, a pressed switch, or none given."""
     word = status.strip().upper().removeprefix("TOOL_")
     return word in ("", "OK") or (word.startswith("SWITCH") and word.endswith("_IS_ON"))
-
-
-def rigid_fault(matrix: Floats) -> tuple[str, str]:
-    """Return kind and description of what keeps a finite 4 x 4 matrix from being a motion of a rigid tool; empty if nothing does.
-
-    Axes count as perpendicular and of length 1 within `RIGID`.
-    """
-    axes = matrix[:3, :3]
-    largest = np.abs(axes).max()
-    lengths = np.linalg.norm(axes, axis=0) if largest < 1e6 else np.full(3, largest)
-    said = ", ".join(f"{v:.4g}" for v in lengths)
-    if lengths.min() < 1e-6:
-        return "empty", f"expected axes of length 1; got {said}: the tool is probably not seen"
-    if np.abs(lengths - 1.0).max() > RIGID:
-        return "scaled", f"expected axes of length 1; got {said}: a tool's transform has no scale, send mm"
-    if np.abs(axes.T @ axes - np.diag(lengths**2)).max() > RIGID:
-        return "skewed", "expected perpendicular axes: a tool's transform has no skew"
-    if np.linalg.det(axes) < 0:
-        return "mirrored", "expected a right-handed rotation; got a mirrored one: one axis has the wrong sign"
-    return "", ""

@@ -31,6 +31,7 @@ if TYPE_CHECKING:  # the menu, loaded on demand
         picture_plane,
         pose_in_space,
         probe_angles,
+        rigid_fault,
         tip_frame,
     )
     from echospline.scene.transducer import FWHM, TRANSDUCERS, Transducer
@@ -93,6 +94,7 @@ __all__ = [
     "pose_in_space",
     "probe_angles",
     "probe_plane",
+    "rigid_fault",
     "shades",
     "tip_frame",
     "transform_between",

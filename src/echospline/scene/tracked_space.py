@@ -10,7 +10,7 @@ from echospline.scene.imaging_plane import ImagingPlane, Reach, TrackedNeedle
 from echospline.scene.space import SpatialPose, as_triple
 
 RIGID = 0.02
-"""Cosine of the angle between columns and rows up to which it is rounding (1.1 degrees)."""
+"""Deviation of axes from length 1 and from right angles (1.1 degrees); trackers round to four digits, scales are gross."""
 STEEP = 0.05
 """Least share of the direction that points into depth for a needle above the skin to aim at a point of it (3 degrees)."""
 
@@ -62,6 +62,26 @@ def tip_frame(pose: SpatialPose) -> Floats:
     return matrix
 
 
+def rigid_fault(matrix: Floats) -> tuple[str, str]:
+    """Return kind and description of what keeps a finite 4 x 4 matrix from being a motion of a rigid tool; empty if nothing does.
+
+    Axes count as perpendicular and of length 1 within `RIGID`.
+    """
+    axes = matrix[:3, :3]
+    largest = np.abs(axes).max()
+    lengths = np.linalg.norm(axes, axis=0) if largest < 1e6 else np.full(3, largest)
+    said = ", ".join(f"{v:.4g}" for v in lengths)
+    if lengths.min() < 1e-6:
+        return "empty", f"expected axes of length 1; got {said}: the tool is probably not seen"
+    if np.abs(lengths - 1.0).max() > RIGID:
+        return "scaled", f"expected axes of length 1; got {said}: a tool's transform has no scale, send mm"
+    if np.abs(axes.T @ axes - np.diag(lengths**2)).max() > RIGID:
+        return "skewed", "expected perpendicular axes: a tool's transform has no skew"
+    if np.linalg.det(axes) < 0:
+        return "mirrored", "expected a right-handed rotation; got a mirrored one: one axis has the wrong sign"
+    return "", ""
+
+
 def nearest_rigid(matrix: Floats) -> Floats:
     """Return the motion nearest to a 4 x 4 matrix whose axes a tracker has rounded: same translation, nearest rotation."""
     u, _, v = np.linalg.svd(matrix[:3, :3])
@@ -71,13 +91,25 @@ def nearest_rigid(matrix: Floats) -> Floats:
     return rigid
 
 
-def picture_plane(matrix: Floats, grid: RegularGrid) -> ImagingPlane:
-    """Return the plane of a picture by the matrix from its pixels to the scene, whose axes may be rounded.
+def picture_plane(matrix: Floats, grid: RegularGrid, skew: float = RIGID) -> ImagingPlane:
+    """Return the plane of a picture by the matrix from its pixels to the scene.
+
+    Where its columns and rows are not quite perpendicular, the plane's axes are the perpendicular ones nearest to them. The plane's origin is
+    where the matrix puts the origin of the picture's frame.
+
+    Parameters
+    ----------
+    matrix : ndarray, shape (4, 4)
+        Pixel (column, row, 0) to the scene, mm; its third column is not used.
+    grid : RegularGrid
+        The pixels in the picture's frame, mm.
+    skew : float
+        Largest cosine of the angle between columns and rows.
 
     Raises
     ------
     InputError
-        If the axes have another spacing than the picture (beyond 1 %), or are not perpendicular (beyond `RIGID`).
+        If the axes have another spacing than the picture (beyond 1 %), or are skewed more.
     """
     lengths = np.linalg.norm(matrix[:3, :2], axis=0)
     if lengths.min() >= 1e-9 and not np.allclose(lengths, grid.spacing, rtol=0.01):
@@ -90,15 +122,21 @@ def picture_plane(matrix: Floats, grid: RegularGrid) -> ImagingPlane:
             "a picture's transform has columns and rows of a length; got 0: the probe is probably not seen"
         )
     x, y = (matrix[:3, :2] / lengths).T
-    if abs(float(x @ y)) > RIGID:
+    if abs(float(x @ y)) > skew:
         raise InputError(
-            "a picture's transform has perpendicular columns and rows: a calibration has no skew"
+            f"a picture's transform has perpendicular columns and rows, within {_degrees(skew):.1f} degrees; got "
+            f"{_degrees(float(x @ y)):.1f} degrees of skew: calibrate again"
         )
-    turned = matrix.copy()
+    turned = np.eye(4)
     turned[:3, :3] = np.column_stack((x, y, np.cross(x, y)))
-    turned = nearest_rigid(turned)
-    turned[:3, :2] *= lengths
-    return ImagingPlane.of_image(turned, grid)
+    origin = -np.array(grid.origin) / np.array(grid.spacing)
+    turned[:3, 3] = matrix[:3, :2] @ origin + matrix[:3, 3]
+    return ImagingPlane(nearest_rigid(turned))
+
+
+def _degrees(cosine: float) -> float:
+    """Return the deviation from a right angle, degrees."""
+    return float(np.degrees(np.arcsin(min(abs(cosine), 1.0))))
 
 
 def probe_angles(plane: ImagingPlane) -> tuple[float, float, float]:
