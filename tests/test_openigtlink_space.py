@@ -6,6 +6,8 @@ import logging
 import subprocess
 import sys
 import time
+from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -30,6 +32,7 @@ from echospline.openigtlink import (
     Status,
     String,
     Transform,
+    read_calibration,
 )
 from echospline.openigtlink.image import Image
 from echospline.openigtlink.tools import Tool, TrackingData
@@ -37,6 +40,7 @@ from echospline.openigtlink.tracking_space import SpatialTracking
 from echospline.scene import (
     AXIAL,
     ImagingPlane,
+    Probe,
     SpatialInsertion,
     SpatialPose,
     Volume,
@@ -527,3 +531,116 @@ def test_a_volume_from_slicer_stands_where_slicer_shows_it(tmp_path):
     np.testing.assert_allclose(
         (LPS_TO_RAS @ scene_to_file(path, "y", volume))[:3, 3], LPS_TO_RAS[:3, :3] @ (0, 0, 0), atol=1e-9
     )
+
+
+# ---- the device set of PLUS that is shipped
+
+DEVICE_SET = Path(__file__).parent.parent / "examples" / "plus-echospline-space.xml"
+
+
+def definitions() -> dict[str, np.ndarray]:
+    """CoordinateDefinitions, read here by hand."""
+    found = ElementTree.parse(DEVICE_SET).getroot().find("CoordinateDefinitions")
+    assert found is not None
+    return {
+        f"{t.get('From')}To{t.get('To')}": np.array(t.get("Matrix", "").split(), dtype=float).reshape(4, 4)
+        for t in found
+    }
+
+
+def test_the_shipped_device_set_hangs_together():
+    """What its server sends is enough for echospline, and every stream that is named is made by a device."""
+    root = ElementTree.parse(DEVICE_SET).getroot()
+    made = {o.get("Id") for o in root.iter("OutputChannel")}
+    used = {i.get("Id") for i in root.iter("InputChannel")}
+    server = root.find("PlusOpenIGTLinkServer")
+    assert server is not None
+    assert used | {server.get("OutputChannelId")} <= made
+    device = next(d for d in root.iter("Device") if d.get("Type") == "OpenIGTLinkVideo")
+    assert (device.get("ServerPort"), server.get("ListeningPort")) == ("18944", "18945")
+    sources = {s.get("Id"): s.get("PortUsImageOrientation") for s in device.iter("DataSource")}
+    assert sources == {"Video": "MF"}
+    tracking = SpatialTracking(
+        Probe(pixel=0.12).grid, AXIAL, Naming(calibration=read_calibration(DEVICE_SET))
+    )
+    for name in server.iter("Transform"):
+        tracking.put(str(name.get("Name")), rigid((0, 0, 0), (20.0, 30.0, 40.0)))
+    located = tracking.locate()
+    assert located.plane is not None
+    assert located.needle is not None
+    assert located.fault == ""
+
+
+def test_our_reader_takes_the_shipped_device_set_as_it_is_written():
+    read = read_calibration(DEVICE_SET)
+    assert set(read) == {"NeedleTipToNeedle", "ImageToProbe", "SceneToReference"}
+    for name, matrix in definitions().items():
+        np.testing.assert_array_equal(read[name], matrix)
+    # the middle of the face is where the comment says, and the scene where it is without the transform
+    grid = Probe(pixel=0.12).grid
+    assert grid.shape[0] == 333
+    np.testing.assert_allclose(picture_plane(read["ImageToProbe"], grid).matrix[:3, 3], (0, 60, 0), atol=1e-9)
+    np.testing.assert_array_equal(read["SceneToReference"], AXIAL)
+
+
+def test_the_shipped_device_set_moves_probe_and_needle_from_another_librarys_server():
+    """pyigtl's server stands for PlusServer; echospline is started as docs/slicer.md says."""
+    pyigtl = pytest.importorskip("pyigtl", reason="pyigtl, the second peer, is not installed")
+    there, port, defined = free_port(), free_port(), definitions()
+    reference = defined["SceneToReference"]
+    to_marker = rigid((0, 0, 0), (0, 60, 0))  # the middle of the face, by the comment in the file
+    plane = probe_plane((2.0, 0.0, -3.0), 20.0, 5.0)
+    needle = SpatialPose((-10.0, 0.0, -3.0), (0.0, 12.0, -2.0))
+    sent = {
+        "ProbeToReference": reference @ plane.matrix @ np.linalg.inv(to_marker),
+        "NeedleToReference": reference @ tip_frame(needle) @ np.linalg.inv(defined["NeedleTipToNeedle"]),
+    }
+    server = pyigtl.OpenIGTLinkServer(port=there)
+    words = [
+        "link",
+        "sample:spine",
+        "--config",
+        str(DEVICE_SET),
+        "--connect",
+        f"127.0.0.1:{there}",
+        "--silence",
+        "3600",
+    ]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "echospline", *words, "--port", str(port), "--duration", "90"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert process.stdout is not None
+        assert "OpenIGTLink on" in process.stdout.readline()
+        until = time.monotonic() + 60
+        while not server.is_connected():
+            assert time.monotonic() < until
+            time.sleep(0.05)
+        for name, matrix in sent.items():
+            server.send_message(pyigtl.TransformMessage(matrix, device_name=name), wait=True)
+        peer = Console(port)
+        expected = sent["ProbeToReference"] @ defined["ImageToProbe"]
+
+        def placed(message: Message) -> bool:
+            return isinstance(message.content, Image) and bool(
+                np.abs(message.content.matrix[:, [0, 1, 3]] - expected[:, [0, 1, 3]]).max() < 1e-3
+            )
+
+        assert peer.wait(placed).content.voxels.std() > 5
+        tip = sent["NeedleToReference"] @ defined["NeedleTipToNeedle"]
+
+        def arrived(message: Message) -> bool:
+            return message.device == "NeedleTipToReference" and bool(
+                np.abs(message.content.matrix[:3, 2:] - tip[:3, 2:]).max() < 1e-3
+            )
+
+        peer.wait(arrived)
+        peer.wait(said("green, live", "tip 0.0 12.0 -2.0 mm"))
+        peer.close()
+    finally:
+        process.terminate()
+        process.wait(20)
+        server.stop()

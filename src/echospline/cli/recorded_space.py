@@ -54,7 +54,7 @@ def recorded_in_volume(
 
     spacing = changes.pop("image.spacing", None)
     for key in changes:
-        if key == "output.fps" or key.startswith(("space.probe", "space.needle")):
+        if key == "output.fps" or key.startswith(("space.probe", "space.needle", "needle.")):
             raise InputError(f"{key} has no meaning here, because {MOVED}")
     scenario, folder = scenario_from(volume, changes)
     image = scenario.image.file
