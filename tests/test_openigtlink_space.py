@@ -187,6 +187,23 @@ def test_a_calibration_for_another_picture_is_refused_before_it_is_used():
         picture_plane(np.zeros((4, 4)), PIXELS)
 
 
+@pytest.mark.parametrize(
+    ("matrix", "words"),
+    [
+        (np.diag([1.0, 1.0, -1.0, 1.0]), "mirrored"),
+        (np.diag([1e-3, 1e-3, 1e-3, 1.0]), "no scale"),
+        (np.array([[1, 0.2, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]), "perpendicular"),
+        (np.diag([0.0, 0.0, 0.0, 1.0]), "axes of length 1; got 0, 0, 0"),
+        (np.full((4, 4), np.nan), "finite"),
+    ],
+)
+@pytest.mark.parametrize("name", ["NeedleTipToNeedle", "SceneToReference"])
+def test_a_calibration_that_is_not_rigid_is_refused_before_it_is_used(name, matrix, words):
+    with pytest.raises(InputError, match=words) as refusal:
+        SpatialTracking(PIXELS, AXIAL, Naming(calibration={name: matrix}))
+    assert "\n" not in str(refusal.value)
+
+
 def moved(x: float) -> np.ndarray:
     return AXIAL @ probe_plane((x, 0.0, 0.0)).matrix
 

@@ -83,7 +83,7 @@ class SpatialTracking:
     Raises
     ------
     InputError
-        If the calibration has a transform from the picture to the probe that does not fit the picture.
+        If the calibration has a transform from the picture to the probe that does not fit the picture, or another that is not rigid.
     """
 
     def __init__(self, grid: RegularGrid, place: Floats, naming: Naming, silence: float = 0.5) -> None:
@@ -94,6 +94,10 @@ class SpatialTracking:
         self._needle: TrackedNeedle | None = None
         self.picture_to_probe: Floats = np.eye(4)
         """From the picture's frame to the probe's, mm, by the calibration."""
+        for name, matrix in naming.calibration.items():
+            kind, reason = rigid_fault(matrix) if naming.image not in frames_of(name) else ("", "")
+            if kind:
+                raise InputError(f"calibration {name}: {reason}")
         calibrated = chain_between(naming.calibration, naming.image, naming.probe)
         if calibrated is not None:
             try:
