@@ -257,6 +257,21 @@ def test_pictures_in_which_a_tool_is_lost_are_bridged_and_said(made, scene, tmp_
     np.testing.assert_allclose(planes, expected, atol=1e-6)
 
 
+def test_a_recording_that_begins_with_the_needle_inside_is_said_and_ends_as_the_whole_one(
+    made, scene, tmp_path
+):
+    write_config(scene / "plus.xml", to_probe())
+    path = write_recording(scene / "late.igs.mha", made[8:])
+    result = replay(path, tmp_path / "out", "--no-figure")
+    assert result.exit_code == 0, result.output
+    assert f"the needle is {made[8].pose.depth:.1f} mm deep when the recording begins" in result.stderr
+    with np.load(tmp_path / "out" / "displacement.npz") as record:
+        assert not record["displacement"][0].any()
+        last = record["displacement"][-1]
+    whole = made[-1].displacement
+    assert np.linalg.norm(last - whole) < 0.05 * np.linalg.norm(whole)
+
+
 def test_a_file_with_numbers_that_are_none_is_refused(made, tmp_path):
     path = write_recording(tmp_path / "nan.igs.mha", made[:3], {(1, "Probe"): np.full((4, 4), np.nan)})
     with pytest.raises(InputError, match="Seq_Frame0001_ProbeToTrackerTransform must be 16 finite numbers"):

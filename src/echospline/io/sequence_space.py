@@ -30,6 +30,8 @@ SCENE = "Scene"
 SKEWED = 0.1
 """Cosine of the angle between columns and rows that a recording's calibration may have (5.7 degrees): one that was fitted without the
 condition of right angles has some (the spine sweep of PLUS 2.8 degrees), and here pixels are put where it says."""
+ARRIVES = 1.0
+"""mm; a needle deeper than this in the first picture was not pushed there in it."""
 UNEVEN = 0.5
 """Deviation of a picture's time from an even rate, in pictures, from which it is said."""
 
@@ -192,7 +194,12 @@ def paths_in_scene(
         notes.append(
             f"no transform leads from {needle} to {reference}: the recording has no needle, tissue stays at rest"
         )
-    elif len(seen) < len(pictures):
+    elif poses[seen[0]].depth > ARRIVES:
+        notes.append(
+            f"the needle is {poses[seen[0]].depth:.1f} mm deep when the recording begins: the tissue counts as at rest then, and it is pushed there "
+            "within a picture"
+        )
+    if 0 < len(seen) < len(pictures):
         notes.append(f"the needle is bridged in {len(pictures) - len(seen)} of {len(pictures)} pictures")
     off = float(np.abs(times * fps - np.arange(len(pictures))).max())
     if off > UNEVEN:
