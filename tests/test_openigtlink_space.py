@@ -183,6 +183,8 @@ def test_a_calibration_for_another_picture_is_refused_before_it_is_used():
     skewed[0, 1] = 0.05
     with pytest.raises(InputError, match="perpendicular"):
         picture_plane(skewed / np.array([1, np.hypot(0.25, 0.05) / 0.25, 1, 1]), PIXELS)
+    with pytest.raises(InputError, match=r"in mm; got 1e\+200"):
+        picture_plane(np.diag([1e200, 0.25, 1, 1]), PIXELS)
     with pytest.raises(InputError, match="a length"):
         picture_plane(np.zeros((4, 4)), PIXELS)
 
@@ -258,6 +260,22 @@ def test_a_matrix_that_no_probe_can_have_is_refused(matrix, words):
     assert located.plane.matrix[0, 3] == 1.0
     assert located.probe_held
     assert located.fault == "Refused"
+
+
+@pytest.mark.parametrize(
+    ("matrix", "words"),
+    [
+        (np.diag([1e200, 0.25, 1.0, 1.0]), "the picture's place in mm; got 1e"),
+        (np.full((4, 4), np.inf), "finite numbers"),
+    ],
+)
+def test_a_place_that_no_picture_can_have_is_refused(matrix, words):
+    tracking = SpatialTracking(PIXELS, AXIAL, Naming())
+    tracking.put("ImageToReference", AXIAL @ PLANE.image_matrix(PIXELS))
+    with pytest.raises(InputError, match=words):
+        tracking.put("ImageToReference", matrix)
+    assert tracking.locate().probe_held
+    np.testing.assert_allclose(tracking.locate().plane.matrix, PLANE.matrix, atol=1e-9)
 
 
 def test_a_needle_without_its_tip_is_explained_and_the_probe_goes_on():

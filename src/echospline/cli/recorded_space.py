@@ -46,6 +46,9 @@ def recorded_in_volume(
     InputError
         If the volume is none, the recording does not lead to it, or an option says what the recording says.
     """
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
     # they load SimpleITK
     from echospline.io.sequence import read_sequence
     from echospline.io.sequence_space import face_grid, paths_in_scene
@@ -102,10 +105,15 @@ def recorded_in_volume(
     scenario = scenario.model_copy(update={"space": space, "output": output})
     model = build_spatial_model(scenario, space.grid(opened.volume), opened.tissue)
     comparison = Comparison(sequence.frames, grid, paths, space.probe.probe())
-    with claimed(out):
+    console = Console(stderr=True)
+    columns = (TextColumn("simulating"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    quiet = as_json or not console.is_terminal
+    with claimed(out), Progress(*columns, console=console, transient=True, disable=quiet) as bar:
+        task = bar.add_task("simulating", total=None)
         report = run_space(
-            scenario, opened.volume, model, out, folder, watch=comparison.add, doubts=paths.notes
-        )
+            scenario, opened.volume, model, out, folder, watch=comparison.add, doubts=paths.notes,
+            progress=lambda done, count: bar.update(task, completed=done, total=count),
+        )  # fmt: skip
         write_table(out / "comparison.csv", comparison.rows)
     say(doubt for doubt in report["doubts"] if doubt not in paths.notes)
     told = {"recording": file.name, **comparison.medians(), "results": str(out)}

@@ -183,7 +183,7 @@ class Received:
                 "expected 4 x 4 finite numbers with the last row 0 0 0 1, and a unit quaternion where there is one"
             )
         if self.naming.image in frames_of(name):
-            return "", ""
+            return _picture_fault(matrix)
         kind, reason = rigid_fault(matrix)
         if kind:
             return kind, reason
@@ -306,6 +306,14 @@ class Tracking:
                 f"there are {', '.join(sorted(known))}"
             )
         return Located(plane, None, trouble, "Transforms" if trouble else "")
+
+
+def _picture_fault(matrix: Floats) -> tuple[str, str]:
+    """Return kind and reason if no picture can have this matrix, whose columns may hold its spacing."""
+    largest = float(np.abs(matrix).max())
+    if largest > FARTHEST:
+        return "far", f"expected the picture's place in mm; got {largest:.4g}, farther than any tracker sees"
+    return "", ""
 
 
 def is_valid(status: str) -> bool:

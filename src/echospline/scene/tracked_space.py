@@ -11,6 +11,8 @@ from echospline.scene.space import SpatialPose, as_triple
 
 RIGID = 0.02
 """Deviation of axes from length 1 and from right angles (1.1 degrees); trackers round to four digits, scales are gross."""
+FARTHEST = 1e6
+"""mm; no picture lies farther, nor has such pixels: beyond, squares of the numbers would overflow."""
 STEEP = 0.05
 """Least share of the direction that points into depth for a needle above the skin to aim at a point of it (3 degrees)."""
 
@@ -109,8 +111,10 @@ def picture_plane(matrix: Floats, grid: RegularGrid, skew: float = RIGID) -> Ima
     Raises
     ------
     InputError
-        If the axes have another spacing than the picture (beyond 1 %), or are skewed more.
+        If the axes have another spacing than the picture (beyond 1 %), or are skewed more, or a number is beyond `FARTHEST`.
     """
+    if (largest := float(np.abs(matrix).max())) > FARTHEST:
+        raise InputError(f"a picture's transform is in mm; got {largest:.4g}, farther than any tracker sees")
     lengths = np.linalg.norm(matrix[:3, :2], axis=0)
     if lengths.min() >= 1e-9 and not np.allclose(lengths, grid.spacing, rtol=0.01):
         raise InputError(
