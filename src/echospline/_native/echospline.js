@@ -57,6 +57,13 @@ export const LandmarkKind = Object.freeze({ CONTACT: 0, LEAVING: 1, TIP: 2, TIP_
  *   smallest_jacobian: number, place: number[]
  * }} PictureReport
  */
+/**
+ * How a picture is shown, named as in echospline_look; `depth_gains` has as many numbers as there are sliders.
+ * @typedef {{
+ *   level?: number, invert?: number, flip?: number, gain?: number, recorded_range?: number, dynamic_range?: number,
+ *   depth_gains?: Numbers
+ * }} Look
+ */
 /** @typedef {Uint8Array | Uint16Array | Int16Array | Float32Array} Pixels */
 /** @typedef {{ entry: Numbers, tip: Numbers, speed: number, dt: number }} Pose */
 /** @typedef {{ entry: Numbers, tip: Numbers, lag: number, fastest: number }} Command */
@@ -150,6 +157,11 @@ export const LAYOUTS = Object.freeze({
     ["struct_size", "u32"], ["method", "i32"], ["residual", "f64"], ["difference", "f64"], ["exact_share", "f64"],
     ["folded_cells", "i64"], ["smallest_jacobian", "f64"], ["place", "f64", 2],
   ]),
+  echospline_look: layout([
+    ["struct_size", "u32"], ["level", "i32"], ["invert", "i32"], ["flip", "i32"], ["gain", "f64"],
+    ["recorded_range", "f64"], ["dynamic_range", "f64"], ["depth_gain_count", "i32"], ["reserved", "i32"],
+    ["depth_gains", "f64", 8],
+  ]),
   echospline_forced_options: layout([
     ["struct_size", "u32"], ["level", "i32"], ["node_count", "i64"], ["low", "f64", 2], ["high", "f64", 2],
     ["tip", "f64"], ["friction_limit", "f64"], ["bond", "f64"], ["tip_stiffness", "f64"], ["side_stiffness", "f64"],
@@ -238,6 +250,24 @@ export class Core {
       const status = this.functions.echospline_follow(at, at + 2 * pose.size, at + pose.size);
       if (status !== Status.OK) throw new CoreError(status, this.text(this.functions.echospline_status_text(status)));
       return /** @type {any} */ (this.read(at + pose.size, pose));
+    } finally {
+      this.functions.free(at);
+    }
+  }
+
+  /**
+   * Shade a grey picture in the module's memory into red, green, blue and alpha.
+   * @param {Look} look @param {number} grey address @param {number} columns @param {number} rows @param {number} rgba address
+   */
+  shade(look, grey, columns, rows, rgba) {
+    const shape = LAYOUTS.echospline_look;
+    const at = this.allocate(shape.size);
+    try {
+      this.write(at, shape, { struct_size: shape.size });
+      this.functions.echospline_look_defaults(at);
+      this.write(at, shape, { ...look, depth_gain_count: look.depth_gains?.length ?? 0 });
+      const status = this.functions.echospline_shade(at, grey, columns, rows, rgba, BigInt(4 * columns * rows));
+      if (status !== Status.OK) throw new CoreError(status, this.text(this.functions.echospline_status_text(status)));
     } finally {
       this.functions.free(at);
     }
@@ -688,6 +718,8 @@ export class Picture {
       const { columns, rows, channels, pixel_type, mesh_shape } = /** @type {any} */ (core.read(at, shape));
       /** @type {number} */
       this.pixels = columns * rows;
+      this.columns = columns;
+      this.grey = pixel_type === PixelType.UINT8 && channels === 1;
       const type = [Uint8Array, Uint16Array, Int16Array, Float32Array][pixel_type];
       const expected = this.pixels * channels;
       if (type === undefined || !(pixels instanceof type) || pixels.length !== expected) {
@@ -706,6 +738,7 @@ export class Picture {
     this.size = Number(core.functions.echospline_picture_size(this.handle));
     this.level = core.text(core.functions.echospline_level_name(core.functions.echospline_picture_level(this.handle)));
     this.out = core.allocate(this.size);
+    this.rgba = this.grey ? core.allocate(4 * this.pixels) : 0;
     this.field = core.allocate(8 * this.numbers);
     this.needle = core.allocate(LAYOUTS.echospline_needle.size);
   }
@@ -748,6 +781,16 @@ export class Picture {
     const at = needle === null ? 0 : this.placeNeedle(needle);
     this.check(this.core.functions.echospline_picture_draw(this.handle, at, this.out, BigInt(this.size)));
     return new this.type(this.core.buffer, this.out, this.size / this.type.BYTES_PER_ELEMENT);
+  }
+
+  /**
+   * Shade the picture that was drawn last, for ImageData: a view of red, green, blue and alpha.
+   * @param {Look} look @returns {Uint8ClampedArray}
+   */
+  shade(look) {
+    if (!this.grey) throw new CoreError(Status.WRONG_VALUE, "expected a picture of grey Uint8Array pixels; this one is not: draw it as it is");
+    this.core.shade(look, this.out, this.columns, this.pixels / this.columns, this.rgba);
+    return new Uint8ClampedArray(this.core.buffer, this.rgba, 4 * this.pixels);
   }
 
   /** Column and row of the reference that each pixel comes from; NaN where no tissue is. @returns {{ x: Float32Array, y: Float32Array }} */
@@ -811,8 +854,8 @@ export class Picture {
   destroy() {
     const { functions } = this.core;
     functions.echospline_picture_destroy(this.handle);
-    for (const at of [this.out, this.field, this.needle]) functions.free(at);
-    this.handle = this.out = this.field = this.needle = 0;
+    for (const at of [this.out, this.rgba, this.field, this.needle]) functions.free(at);
+    this.handle = this.out = this.rgba = this.field = this.needle = 0;
   }
 }
 
