@@ -61,10 +61,11 @@ def tables(solver: BoundaryForces | QuadraticSolve) -> dict[str, Any]:
 
 def _boundary(s: BoundaryForces) -> dict[str, Any]:
     conditions, sides = [], []
+    side: tuple[int, int, int]
     for piece in s.pieces:
         conditions.append(np.hstack([piece.points, piece.normals]))
         if len(piece.bodies) == 2:
-            side = (core.GreenCondition.CONDITION_INTERFACE, *piece.bodies)
+            side = (core.GreenCondition.CONDITION_INTERFACE, piece.bodies[0], piece.bodies[1])
         else:
             kinds = {
                 "clamped": core.GreenCondition.CONDITION_CLAMPED,
@@ -162,7 +163,7 @@ class NativeGreen:
 
 NUMBERS = tuple(
     name
-    for name, kind in core.GreenOptions._fields_
+    for name, kind in ((field[0], field[1]) for field in core.GreenOptions._fields_)
     if name not in ("struct_size", "level", "reserved", "right", "left", *COUNTS)
     and kind is not ctypes.c_void_p
 )
