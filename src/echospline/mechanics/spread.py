@@ -29,8 +29,16 @@ WIDEST = 0.2
 
 
 def softest(tissue: Tissue) -> float:
-    """Least Young's modulus of tissue and regions, kPa."""
-    return min([tissue.young, *(region.young for region in tissue.regions)])
+    """Least Young's modulus of tissue and regions, kPa, but for fluids, which bear no needle."""
+    return min([tissue.young, *(region.young for region in tissue.regions if not region.fluid)])
+
+
+def least_near(tissue: Tissue) -> float:
+    """Return the least modulus of a closed form near a force, kPa: the softest solid's in tissue with fluids, else 0, which is none.
+
+    A force whose spread suits that solid would fold fluid by its own closed form, by more than elements can correct.
+    """
+    return softest(tissue) if any(region.fluid for region in tissue.regions) else 0.0
 
 
 def bearable(young: float, radius: float, spacing: float) -> float:

@@ -175,12 +175,16 @@ class VolumeLabel:
 
 @dataclass(frozen=True)
 class Region:
-    """Part of the tissue that differs: its shape, Young's modulus (kPa), Poisson's ratio and name."""
+    """Part of the tissue that differs: its shape, Young's modulus (kPa), Poisson's ratio and name.
+
+    A fluid (urine, blood) is as soft as its modulus says, but the needle's forces are not spread so wide that it alone would bear them.
+    """
 
     shape: Shape
     young: float
     poisson: float = 0.45
     name: str = ""
+    fluid: bool = False
 
     def __post_init__(self) -> None:
         _check(self.young, self.poisson, f"region {self.name!r}" if self.name else "a region")
