@@ -127,6 +127,7 @@ OPTIONS = (
     Option("--material", "tissue.material", "linear|neo-hookean", None, "Model fem"),
     Option("--thickness", "tissue.thickness", "MM", None, "Model fem, green"),
     Option("--depth-axis", "space.depth_axis", "AXIS", None, "Space"),
+    Option("--space-mesh", "space.mesh.nodes", "NXxNYxNZ", _nodes, "Space"),
     Option("--tissue", "space.tissue", "own|homogeneous", None, "Space"),
     Option("--view", "space.probe.view", "longitudinal|transverse", None, "Space"),
     Option("--probe", "space.probe", "X,Y,Z[,YAW,PITCH,ROLL]", _probe, "Space"),
