@@ -8,8 +8,8 @@ import pytest
 
 from echospline.errors import InputError
 from echospline.mechanics import Elastic, NeedleForces, SpatialForceModel, SpatialLandmarkModel, ThinPlate
-from echospline.mechanics.spatial_landmark_model import IN_SPACE
 from echospline.mechanics.landmarks import Clamps, contact_lattice
+from echospline.mechanics.spatial_landmark_model import IN_SPACE
 from echospline.mechanics.spread import bearable, radius_for
 from echospline.scene import Circle, Layer, Region, SpatialGrid, SpatialInsertion, SpatialPose, Sphere, Tissue
 
