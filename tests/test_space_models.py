@@ -329,6 +329,21 @@ def test_a_mesh_between_whose_nodes_a_needle_is_lost_is_refused_and_the_remedy_i
         SpatialLandmarkModel(grid, BOX, parameters=replace(parameters, delta=2.2))
 
 
+def test_the_core_lays_the_lattice_of_the_reference_where_nodes_do_not_divide_its_spacing():
+    """At 1.3 mm every node is in it: every second one would be 2.6 mm apart, more than the 2 mm asked for."""
+    grid = SpatialGrid((13, 12, 11), (1.3, 1.3, 1.3), (-7.8, 0.0, -6.5))
+    parameters = replace(IN_SPACE, anchor_spacing=8.0)
+    made = SpatialLandmarkModel(grid, BOX, parameters=parameters, precision="double")
+    reference = made.reference()
+    insertion = SpatialInsertion.straight((0.6, 0, 0.6), (0, 1, 0), 6.0, 5.0, dwell=0.0, retract=False)
+    state, other = made.rest(), reference.rest()
+    for i in range(1, 7):
+        pose = insertion.pose(0.2 * i)
+        state, other = made.advance(state, pose, 0.2), reference.advance(other, pose, 0.2)
+    points = grid.nodes[::7]
+    np.testing.assert_allclose(made.field(state)(points), reference.displacement_at(other, points), atol=1e-7)
+
+
 @pytest.mark.parametrize("h", [0.6, 0.9, 1.1, 1.3, 1.9])
 def test_the_lattice_in_space_is_never_further_apart_than_asked_and_close_to_it(h):
     grid = SpatialGrid((31, 31, 31), (h, h, h))
