@@ -8,6 +8,7 @@ import pytest
 
 from echospline.errors import InputError
 from echospline.mechanics import Elastic, NeedleForces, SpatialForceModel, SpatialLandmarkModel, ThinPlate
+from echospline.mechanics.landmarks import Clamps, contact_lattice
 from echospline.mechanics.spatial_landmark_model import IN_SPACE
 from echospline.mechanics.spread import bearable, radius_for
 from echospline.scene import Circle, Layer, Region, SpatialGrid, SpatialInsertion, SpatialPose, Sphere, Tissue
@@ -290,6 +291,66 @@ def test_the_core_steps_as_the_reference_does(kernel, options):
             made.field(state)(points), reference.displacement_at(other, points), atol=1e-7
         )
     assert i * 0.2 == pytest.approx(insertion.duration)
+
+
+@pytest.mark.parametrize("name", ["tps", "elastic"])
+def test_a_shaft_between_rows_of_the_coarsest_mesh_is_followed_all_along(name):
+    """Nodes at 1.5 mm times root 2, the most that is taken, and a shaft in the middle between four rows of them."""
+    h = 1.5 * np.sqrt(2.0)
+    grid = SpatialGrid((16, 15, 13), (h, h, h), (-7.5 * h, 0.0, -5.5 * h))
+    kernel = ThinPlate(3) if name == "tps" else Elastic(0.45, 2.0, dimension=3)
+    made = SpatialLandmarkModel(grid, BOX, kernel=kernel)
+    insertion = SpatialInsertion.straight((0, 0, 0), (0, 1, 0), 18.0, 5.0, dwell=0.0, retract=False)
+    state = made.rest()
+    for i in range(1, 37):
+        state = made.advance(state, insertion.pose(0.1 * i), 0.1)
+    beside = np.array([[0.0, y, 0.0] for y in (2.0, 5.0, 8.0, 11.0, 14.0)])
+    assert made.field(state)(beside)[:, 1].min() > 0.6
+
+
+@pytest.mark.parametrize(
+    ("nodes", "parameters", "said"),
+    [
+        ((14, 13, 11), IN_SPACE, "take a mesh of 20 x 18 x 16 nodes or more, or a delta of 2.2 mm"),
+        ((21, 18, 9), IN_SPACE, "up to 2.14 mm from the next"),
+        ((41, 36, 31), replace(IN_SPACE, contact_spacing=3.0), "take a contact_spacing of 2.1 mm or less"),
+    ],
+)
+def test_a_mesh_between_whose_nodes_a_needle_is_lost_is_refused_and_the_remedy_is_one(
+    nodes, parameters, said
+):
+    grid = SpatialGrid.spanning((-20, 0, -15), (20, 35, 15), nodes)
+    with pytest.raises(InputError, match=said):
+        SpatialLandmarkModel(grid, BOX, parameters=parameters)
+    if "contact_spacing" in said:
+        SpatialLandmarkModel(grid, BOX, parameters=replace(parameters, contact_spacing=2.1))
+    else:
+        SpatialLandmarkModel(SpatialGrid.spanning((-20, 0, -15), (20, 35, 15), (20, 18, 16)), BOX)
+        SpatialLandmarkModel(grid, BOX, parameters=replace(parameters, delta=2.2))
+
+
+def test_the_core_lays_the_lattice_of_the_reference_where_nodes_do_not_divide_its_spacing():
+    """At 1.3 mm every node is in it: every second one would be 2.6 mm apart, more than the 2 mm asked for."""
+    grid = SpatialGrid((13, 12, 11), (1.3, 1.3, 1.3), (-7.8, 0.0, -6.5))
+    parameters = replace(IN_SPACE, anchor_spacing=8.0)
+    made = SpatialLandmarkModel(grid, BOX, parameters=parameters, precision="double")
+    reference = made.reference()
+    insertion = SpatialInsertion.straight((0.6, 0, 0.6), (0, 1, 0), 6.0, 5.0, dwell=0.0, retract=False)
+    state, other = made.rest(), reference.rest()
+    for i in range(1, 7):
+        pose = insertion.pose(0.2 * i)
+        state, other = made.advance(state, pose, 0.2), reference.advance(other, pose, 0.2)
+    points = grid.nodes[::7]
+    np.testing.assert_allclose(made.field(state)(points), reference.displacement_at(other, points), atol=1e-7)
+
+
+@pytest.mark.parametrize("h", [0.6, 0.9, 1.1, 1.3, 1.9])
+def test_the_lattice_in_space_is_never_further_apart_than_asked_and_close_to_it(h):
+    grid = SpatialGrid((31, 31, 31), (h, h, h))
+    at = grid.nodes[contact_lattice(Clamps.of(grid, ("bottom",)), 2.0)]
+    gaps = [np.diff(np.unique(np.round(x, 6))).max() for x in at.T]
+    assert np.allclose(gaps, gaps[0])
+    assert 1.0 < gaps[0] <= 2.0
 
 
 # ---- what makes no sense ---------------------------------------------------------------------------------------------------------

@@ -186,7 +186,9 @@ struct ContactLattice {
   bool build(const Grid<D>& grid, const Clamps<D>& clamps, double spacing) {
     int64_t places = 1, count = 0;
     for (int d = 0; d < D; ++d) {
-      stride[d] = static_cast<int32_t>(larger(1.0, smaller(std::nearbyint(spacing / grid.spacing[d]), 1e9)));
+      // about the spacing in the plane; in space not more, for shafts lie between its rows
+      const double share = spacing / grid.spacing[d], whole = D == 2 ? std::nearbyint(share) : std::floor(share + 1e-9);
+      stride[d] = static_cast<int32_t>(larger(1.0, smaller(whole, 1e9)));
       first[d] = (grid.shape[d] - 1) % stride[d] / 2;
       lines[d] = (grid.shape[d] - 1 - first[d]) / stride[d] + 1;
       places *= lines[d];

@@ -1,4 +1,4 @@
-"""A volume of ultrasound from MetaImage, NRRD or NIfTI, turned so that its depth runs along y and its surface is y = 0."""
+"""A volume of ultrasound from MetaImage, NRRD, NIfTI or DICOM, turned so that its depth runs along y and its surface is y = 0."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ import SimpleITK
 
 from echospline.errors import InputError
 from echospline.io.kind import kind_of
-from echospline.io.recording import LIMIT, decoding
+from echospline.io.recording import LIMIT, Recording, decoding
 from echospline.io.volume import open_volume
 from echospline.scene import Floats, Volume
+from echospline.scene.volume import Voxels
 
 _ITK: Any = SimpleITK
 """SimpleITK, whose functions carry no types."""
@@ -24,12 +25,12 @@ def read_volume(path: str | Path, depth: str = "y", *, limit: float = LIMIT) -> 
     """Read a volume and turn it into the scene's frame.
 
     The file's directions are followed where they swap or reverse axes, so that ``depth`` names an axis of the frame that the
-    file stands in (LPS). A slanted volume keeps its own axes: the nearest of the frame name them, and ``source`` gives the angle.
+    file stands in (LPS, or DICOM's volume frame of reference). A slanted volume keeps its own axes: the nearest of the frame name them, and ``source`` gives the angle.
 
     Parameters
     ----------
     path : path
-        .mha, .mhd, .nrrd, .nhdr, .nii or .nii.gz: grey voxels in three axes.
+        .mha, .mhd, .nrrd, .nhdr, .nii, .nii.gz or enhanced DICOM (Enhanced US Volume): grey voxels in three axes.
     depth : {"x", "-x", "y", "-y", "z", "-z"}
         Axis along which depth grows.
     limit : float
@@ -47,16 +48,12 @@ def read_volume(path: str | Path, depth: str = "y", *, limit: float = LIMIT) -> 
     """
     path = Path(path)
     kind, format = kind_of(path)
+    if kind == "dicom":
+        return _of_dicom(path, limit).with_depth(depth)
     if kind not in ("metaimage", "nrrd", "nifti"):
-        raise InputError(f"{path} is {format}; a volume is read from MetaImage, NRRD or NIfTI")
+        raise InputError(f"{path} is {format}; a volume is read from MetaImage, NRRD, NIfTI or DICOM")
     recording = open_volume(path, kind, format, limit, whole=True)
-    if recording.channels != 1:
-        raise InputError(f"{path} is in colour; a volume has one value per voxel: convert it to grey")
-    if recording.frames < 2 or min(recording.rows, recording.columns) < 2:
-        raise InputError(
-            f"{path} has {recording.columns} x {recording.rows} x {recording.frames} voxels; "
-            "a volume has 2 or more along each of three axes"
-        )
+    _check(path, recording)
     with decoding(path, format):
         reader = _ITK.ImageFileReader()
         reader.SetFileName(str(path))
@@ -66,11 +63,39 @@ def read_volume(path: str | Path, depth: str = "y", *, limit: float = LIMIT) -> 
     if len(size) != 3:
         raise InputError(f"{path} has axes of {tuple(size)}; expected a volume of three")
     voxels = np.stack(list(recording.decode(None, False)))
-    if np.issubdtype(voxels.dtype, np.floating) and not np.isfinite(voxels).all():
-        raise InputError(f"{path} has voxels that are not finite numbers: replace them before use")
+    _check_finite(path, voxels)
     spacing = _spacing(path, recording.spacing, lengths, turned=any("turned" in n for n in recording.notes))
     volume = Volume(voxels, spacing, source=path.name)
     return along_frame(volume, flat.reshape(3, 3)).with_depth(depth)
+
+
+def _of_dicom(path: Path, limit: float) -> Volume:
+    """Read the slices of an enhanced DICOM file, along its frame of reference."""
+    # pydicom takes longer to load than every other reader together: only for its files
+    from echospline.io.dicom import open_dicom_volume, slices  # noqa: PLC0415
+
+    recording, order, spacing, direction = open_dicom_volume(path, limit)
+    _check(path, recording)
+    voxels = np.stack(list(slices(recording, order)))
+    _check_finite(path, voxels)
+    return _along_frame(Volume(voxels, spacing, source=path.name), direction)
+
+
+def _check(path: Path, recording: Recording) -> None:
+    """Refuse what is no volume of grey voxels."""
+    if recording.channels != 1:
+        raise InputError(f"{path} is in colour; a volume has one value per voxel: convert it to grey")
+    if recording.frames < 2 or min(recording.rows, recording.columns) < 2:
+        raise InputError(
+            f"{path} has {recording.columns} x {recording.rows} x {recording.frames} voxels; "
+            "a volume has 2 or more along each of three axes"
+        )
+
+
+def _check_finite(path: Path, voxels: Voxels) -> None:
+    """Refuse voxels that are no numbers."""
+    if np.issubdtype(voxels.dtype, np.floating) and not np.isfinite(voxels).all():
+        raise InputError(f"{path} has voxels that are not finite numbers: replace them before use")
 
 
 def _spacing(

@@ -305,6 +305,12 @@ class Clamps:
         )
 
 
+def strides(grid: Mesh, spacing: float) -> list[int]:
+    """Return from which node to which along each axis the lattice goes: about ``spacing`` mm, in space not more, for shafts lie between its rows."""
+    whole = round if len(grid.shape) == 2 else lambda share: int(share + 1e-9)
+    return [max(1, whole(spacing / h)) for h in grid.spacing]
+
+
 def contact_lattice(clamps: Clamps, spacing: float) -> NDArray[np.intp]:
     """Mesh nodes that may become contacts: every one, or every second, third ..., about ``spacing`` apart.
 
@@ -324,8 +330,7 @@ def contact_lattice(clamps: Clamps, spacing: float) -> NDArray[np.intp]:
         Ascending node indices.
     """
     grid, lines = clamps.grid, []
-    for n, h in zip(grid.shape, grid.spacing, strict=True):
-        stride = max(1, round(spacing / h))
+    for n, stride in zip(grid.shape, strides(grid, spacing), strict=True):
         lines.append(np.arange((n - 1) % stride // 2, n, stride, dtype=np.intp))
     lattice = _indices(grid)[np.ix_(*lines[::-1])].ravel()
     free: NDArray[np.intp] = lattice[~clamps.held[lattice].any(axis=1)]

@@ -8,14 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from functools import partial
+from math import ceil, sqrt
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from echospline.errors import InputError
 from echospline.mechanics.forces import check_step
 from echospline.mechanics.kernels import Elastic, Kernel, ThinPlate
 from echospline.mechanics.landmark_stiffness import landmark_stiffness
-from echospline.mechanics.landmarks import Clamps, contact_lattice, join_gap
+from echospline.mechanics.landmarks import Clamps, contact_lattice, join_gap, strides
 from echospline.mechanics.native import NativeState, NativeStep, Precision
 from echospline.mechanics.parameters import TPSParameters
 from echospline.mechanics.reference import Reference
@@ -27,6 +29,33 @@ IN_SPACE = TPSParameters(anchor_spacing=4.0, contact_spacing=2.0)
 
 Five faces of 40 x 35 x 30 mm have about 450 anchors 4 mm apart; at the plane's 1.5 mm they would be thousands, and their system is full. Friction
 reaches as far as in the plane, 1.5 mm: about two nodes per 2 mm of shaft; a longer reach would make substeps longer."""
+
+
+def refuse_coarse(grid: SpatialGrid, parameters: TPSParameters) -> None:
+    """Refuse a mesh between whose nodes a needle may lie out of reach of all of them: it would push at its tip alone, and rub nothing.
+
+    A line along an axis of the mesh in the middle between four rows of nodes has half the diagonal of their rectangle to each of them; any other
+    line comes closer to some node.
+
+    Raises
+    ------
+    InputError
+        If half that diagonal, at its worst, is more than delta.
+    """
+    along = np.sort(np.multiply(grid.spacing, strides(grid, parameters.contact_spacing)))
+    reach = float(np.hypot(along[-1], along[-2])) / 2.0
+    if reach <= parameters.delta * (1.0 + 1e-9):
+        return
+    low, high = grid.corners
+    apart = parameters.delta * sqrt(2.0)
+    nodes = " x ".join(f"{ceil(width / apart - 1e-9) + 1}" for width in high - low)
+    remedy = f"take a mesh of {nodes} nodes or more, or a delta of {ceil(10.0 * reach) / 10.0:g} mm"
+    if max(grid.spacing) <= apart:
+        remedy = f"take a contact_spacing of {int(10.0 * apart) / 10.0:g} mm or less, or a delta of {ceil(10.0 * reach) / 10.0:g} mm"
+    raise InputError(
+        f"a needle must lie within delta = {parameters.delta:g} mm of nodes that it may touch; they are {along[-1]:.3g} mm apart, and between them it is "
+        f"up to {reach:.3g} mm from the next: {remedy}"
+    )
 
 
 class SpatialLandmarkModel:
@@ -54,7 +83,8 @@ class SpatialLandmarkModel:
     Raises
     ------
     InputError
-        If the kernel is one of the plane, a face has another name, or the anchors are too many or do not determine a spline.
+        If the kernel is one of the plane, the mesh is so coarse that a needle may lie between its nodes, a face has another name, or the
+        anchors are too many or do not determine a spline.
     """
 
     def __init__(
@@ -73,6 +103,7 @@ class SpatialLandmarkModel:
         self.parameters, self.kernel = parameters or IN_SPACE, kernel or ThinPlate(3)
         if self.kernel.dimension != 3:
             raise InputError("a mesh in space takes a kernel of dimension 3; got one of the plane")
+        refuse_coarse(grid, self.parameters)
         self.clamps = Clamps.of(grid, clamped, clamped_points, sliding)
         self.anchors = anchors_for(self.clamps, self.kernel, self.parameters.anchor_spacing)
         self.stiffness: Floats | None = None

@@ -17,6 +17,7 @@ if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.scene.tissue import (
         Box,
         Circle,
+        Extruded,
         Label,
         Layer,
         Polygon,
@@ -54,6 +55,7 @@ __all__ = [
     "Display",
     "Echo",
     "EchoCine",
+    "Extruded",
     "FieldError",
     "Floats",
     "ImagingPlane",

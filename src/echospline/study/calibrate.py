@@ -31,6 +31,9 @@ PRINTED: Mapping[str, Any] = {
 }
 """The laws under which fields are linear in the parameters."""
 
+IN_PLANE = 'parameters are identified in the plane: give a scenario with model.mechanics = "plane"'
+"""What is said to scenarios whose picture is the middle of a slab in space."""
+
 
 def calibrate(
     *,
@@ -129,6 +132,8 @@ def _calibrated(
     kind = model or scene.model.kind
     if kind not in MODELS:
         raise InputError(f"a model is one of {', '.join(MODELS)}; got {kind!r}")
+    if scene.model.mechanics == "space":
+        raise InputError(IN_PLANE)
     if method not in ("closed", "grid"):
         raise InputError(f'method is "closed" or "grid"; got {method!r}')
     scene = scene.with_values({**PRINTED, "model.kind": kind})

@@ -52,7 +52,7 @@ def open_dicom(path: Path, limit: float) -> Recording:
     MissingExtraError
         If its compression needs the extra ``dicom``.
     """
-    with decoding(path, "DICOM"), _quiet():
+    with decoding(path, "DICOM"), quiet():
         check_deflated(path, limit)
         header = read_dataset(path, stop_before_pixels=True, defer_size=_DEFERRED)
         missing = [
@@ -101,7 +101,7 @@ def open_dicom(path: Path, limit: float) -> Recording:
     def decode(frame: int | None, colour: bool) -> Iterator[Pixels]:
         count = 0
         with decoding(path, "DICOM"):
-            for pixels in quietly(shown(frame), _quiet):
+            for pixels in quietly(shown(frame), quiet):
                 if pixels.shape[:2] != (rows, columns):
                     raise InputError(
                         f"{path} declares {columns} x {rows} pixels but a frame has {pixels.shape[1::-1]}"
@@ -119,7 +119,7 @@ def open_dicom(path: Path, limit: float) -> Recording:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """Silence pydicom, which warns and logs every oddity of a header; those that matter become notes or errors."""
     logger = logging.getLogger("pydicom")
     level = logger.level
