@@ -22,11 +22,13 @@ from echospline.io import (
     Recording,
     decoding,
     displacement_shapes,
+    is_spatial_record,
     kind_of,
     list_arrays,
     open_echoes,
     open_recording,
     read_displacement,
+    read_spatial_displacement,
     sample_image,
 )
 from echospline.scene import RegularGrid
@@ -313,6 +315,16 @@ def _of_displacement(path: Path, limit: float) -> dict[str, Any]:
         "frames": len(record),
         "notes": [],
     }
+    if is_spatial_record(path):
+        spatial = read_spatial_displacement(path, limit=limit)
+        moved, depth = (
+            np.linalg.norm(v, axis=-1) for v in (spatial.displacement, spatial.tip - spatial.entry)
+        )
+        about["nodes"] = len(spatial.points)
+        about["notes"].append(
+            "a run in space: points and largest displacement are those of the mesh in space; tracking and identification read the "
+            f"{len(record.points)} points of the picture"
+        )
     try:
         about["mesh"] = list(record.grid().shape)
     except InputError:

@@ -13,6 +13,7 @@ if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.scene.needle import ZERO_LENGTH, Insertion, NeedlePose
     from echospline.scene.number import is_number
     from echospline.scene.probe import Probe
+    from echospline.scene.seen_motion import SeenMotion, seen_motion
     from echospline.scene.space import PlanePath, SpatialGrid, SpatialInsertion, SpatialPose, probe_plane
     from echospline.scene.tissue import (
         Box,
@@ -60,6 +61,7 @@ __all__ = [
     "Reach",
     "Region",
     "RegularGrid",
+    "SeenMotion",
     "Shape",
     "SpatialGrid",
     "SpatialInsertion",
@@ -82,6 +84,7 @@ __all__ = [
     "frames_of",
     "is_number",
     "probe_plane",
+    "seen_motion",
     "shades",
     "transform_between",
 ]
