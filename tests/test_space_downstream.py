@@ -19,6 +19,7 @@ from echospline.mechanics import NeedleForces
 from echospline.mechanics.spatial_force_model import SpatialForceModel
 from echospline.picture.slices import lattice_of
 from echospline.scene import (
+    Cine,
     ImagingPlane,
     PlanePath,
     Probe,
@@ -29,7 +30,8 @@ from echospline.scene import (
     seen_motion,
     transform_between,
 )
-from echospline.tracking import read_track
+from echospline.tracking import FlowTracker, Track, read_track, score, track
+from echospline.tracking.score import true_motion
 
 PROBE = Probe(width=20.0, depth=20.0, pixel=0.25, elevation=0.0)
 
@@ -154,6 +156,86 @@ def test_tissue_beyond_the_picture_or_never_seen_is_not_valid():
     assert seen.valid.tolist() == [False, True, False]
     with pytest.raises(InputError, match="shapes"):
         seen_motion(first, first, plane, PROBE, np.ones(3, bool))
+
+
+SCORED = Probe(width=20.0, depth=20.0, pixel=0.1, elevation=1.0, elevation_depth=10.0, element_height=0.0)
+
+
+@pytest.fixture(scope="module")
+def tracked(tmp_path_factory):
+    """A cine of fine speckle by a probe that shifts in its plane and drifts out of it, tracked, and the record of its truth.
+
+    Across the slice speckle is as long as a beam of sigma 1 mm makes it: a correlation of exp(-d^2 / 2), of noise smoothed over 1 mm / sqrt(2).
+    """
+    noise = gaussian_filter(np.random.default_rng(5).normal(size=(81, 81, 81)), (2.36, 1.0, 1.0))
+    grey = (128 + 45 * noise / noise.std()).clip(1, 255).astype(np.uint8)
+    volume = Volume(grey, (0.3, 0.3, 0.3), (-12.0, 0.0, -12.0))
+    model = SpatialForceModel.green(volume.mesh((9, 9, 9)), forces=NeedleForces(tip=0.1))
+    needle = SpatialInsertion.straight((-8.0, 0, 0), (1.0, 1.0, 0.0), 8.0, 8.0)
+    path = PlanePath(np.array([0.0, 1.0]), (probe_plane((0, 0, 0)), probe_plane((0.6, 0.0, 1.5))))
+    frames = list(simulate(volume, needle, model, probe=SCORED, plane=path, fps=10))
+    lattice = lattice_of(SCORED)
+    file = tmp_path_factory.mktemp("tracked") / "displacement.npz"
+    writer = SpatialDisplacementWriter(file, model.grid.nodes, lattice.nodes.reshape(*lattice.shape[::-1], 2))
+    for f in frames:
+        writer.add(f.displacement, f.time, f.pose, f.plane, f.places, f.seen_from(frames[0], SCORED, volume))
+    truth = read_track(writer.close())
+    first = frames[0].image.grid
+    pixels = np.stack([f.image.pixels for f in frames])
+    cine = Cine(pixels, truth.motion.times, type(first)(first.shape, first.spacing), "speckle")
+    x, y = np.meshgrid(np.arange(3.0, 17.1, 1.0), np.arange(3.0, 17.1, 1.0))
+    return track(cine, np.stack([x.ravel(), y.ravel()], axis=1), FlowTracker()), truth
+
+
+def test_a_track_is_near_the_truth_of_its_picture_while_the_tissue_is_in_the_slice(tracked):
+    found, truth = tracked
+    told = score(found, truth)
+    assert told.points > 500
+    assert told.followed > 0.6
+    assert told.axial_um < 60
+    assert told.lateral_um < 60
+    assert told.motion_um > 150
+    # the probe drifts 1.5 mm out of the first plane, the slice keeps 1 mm: the last frames have no truth left
+    _, known = true_motion(truth, found.points, found.times)
+    assert known[:7].any(axis=1).all()
+    assert not known[-2:].any()
+    assert np.isfinite(told.gone_trusted)
+
+
+def test_a_score_is_the_error_that_was_made(tracked):
+    _, truth = tracked
+    times = truth.motion.times[:6]
+    points = np.array([[5.03, 6.0], [9.0, 11.11]])
+    motion, known = true_motion(truth, points, times)
+    assert known.all()
+    confidence = np.ones((6, 2))
+    exact = score(Track(points, times, motion, confidence), truth)
+    assert (exact.axial_um, exact.lateral_um, exact.outliers, exact.points) == (0.0, 0.0, 0.0, 10)
+    off = motion + np.array([0.03, -0.04])
+    off[2, 0] += (0.2, 0.0)
+    confidence[3, 1] = 0.0
+    told = score(Track(points, times, off, confidence), truth)
+    assert told.points == 9
+    assert told.axial_um == pytest.approx(40.0)
+    assert told.lateral_um == pytest.approx(1e3 * np.sqrt((8 * 0.03**2 + 0.23**2) / 9))
+    assert told.outliers == pytest.approx(1 / 9)
+    assert told.followed == pytest.approx(0.9)
+    assert np.isnan(told.gone_trusted)
+
+
+def test_the_truth_between_its_points_and_times_is_linear(tracked):
+    record = tracked[1].motion
+    nx = record.grid().shape[0]
+    i = 5 * nx + 6
+    middle = (record.points[i] + record.points[i + nx]) / 2
+    t = (record.times[2] + record.times[3]) / 2
+    found, known = true_motion(tracked[1], middle[None], np.array([t]))
+    assert known.all()
+    np.testing.assert_allclose(
+        found[0, 0], record.displacement[2:4, [i, i + nx]].mean(axis=(0, 1)), atol=1e-9
+    )
+    with pytest.raises(InputError, match="are both of one run"):
+        true_motion(tracked[1], middle[None], np.array([0.0, 9.0]))
 
 
 @pytest.fixture(scope="module")
