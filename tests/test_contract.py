@@ -12,11 +12,13 @@ from echospline.mechanics import (
     FEMModel,
     GreenModel,
     NeedleForces,
+    SpatialForceModel,
     ThinPlate,
     TPSModel,
     TPSParameters,
     ViscousForces,
 )
+from echospline.mechanics.plane_in_space import PlaneInSpace, slab
 from echospline.picture import Deformation
 from echospline.scenario import MODELS as NAMES
 from echospline.scenario import build_model, load
@@ -52,6 +54,22 @@ def force_model(kind, law, **lengths):
     return make
 
 
+def in_space(kind, **lengths):
+    """The plane z = 0 of a model in space."""
+
+    def make(grid, clamped, scale=1.0):
+        powers = {name: power for name, power in POWERS.items() if hasattr(STICKING, name)}
+        forces = replace(
+            STICKING, **{name: getattr(STICKING, name) * scale**power for name, power in powers.items()}
+        )
+        tissue = Tissue(thickness=40.0 * scale)
+        scaled = {name: scale * value for name, value in lengths.items()}
+        whole = slab(grid, tissue.thickness)
+        return PlaneInSpace(grid, kind(whole, (*clamped, "front", "back"), tissue, forces, **scaled))
+
+    return make
+
+
 MODELS = {
     "tps": landmark_model(ThinPlate()),
     "elastic": landmark_model(Elastic(0.45, 1.0)),
@@ -59,7 +77,12 @@ MODELS = {
     "fem": force_model(FEMModel, STICKING),
     "green, viscous": force_model(GreenModel, VISCOUS, radius=0.4, station_spacing=1.0),
     "fem, viscous": force_model(FEMModel, VISCOUS),
+    "green, in space": in_space(SpatialForceModel.green),
+    "fem, in space": in_space(SpatialForceModel.fem, cell=5.0),
 }
+GIVES = {"green, in space": 0.08}
+"""Of the largest displacement, by which an edge gives way, if more than 0.02: forces outside a face 8 mm apart do not hold it beside a needle that
+enters through it or within 4 mm of it."""
 SCENES = {
     "oblique": (BOX, Insertion.straight((12.0, 0.0), 60, 20, 5, dwell=0.5)),
     "straight down": (BOX, Insertion.straight((20.0, 0.0), 90, 18, 8, dwell=0.5)),
@@ -87,7 +110,7 @@ def size(u):
 
 
 def test_the_list_of_models_is_the_program_s():
-    assert {name.removesuffix(", viscous") for name in MODELS} == set(NAMES)
+    assert {name.partition(",")[0] for name in MODELS} == set(NAMES)
 
 
 @every_model
@@ -117,7 +140,7 @@ def test_tissue_follows_the_needle_and_clamped_edges_stay(model, scene):
     assert np.isfinite(u).all()
     assert size(u).max() > 0.1
     assert u[largest] @ axis > 0.7 * size(u)[largest]
-    assert size(u)[GRID.boundary(clamped)].max() < 0.02 * size(u).max()
+    assert size(u)[GRID.boundary(clamped)].max() < GIVES.get(model, 0.02) * size(u).max()
 
 
 @every_model

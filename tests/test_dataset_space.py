@@ -15,7 +15,7 @@ from echospline.io.volume_writing import write_volume
 from echospline.scenario import load
 from echospline.scene import ImagingPlane, Probe, SpatialPose, Volume, probe_plane
 from echospline.study.dataset import needle_mask
-from echospline.study.dataset_space import SpatialVariation, drawn_space, mask_in_slice
+from echospline.study.dataset_space import SpatialVariation, drawn_space, imaged_space, mask_in_slice
 
 zarr = pytest.importorskip("zarr")
 
@@ -166,3 +166,19 @@ def test_the_mask_is_what_lies_near_the_shaft_inside_the_slice(numbers, yaw):
     seen = mask.ravel()
     assert (nearest[seen] <= 0.6 + 0.06).all()
     assert not (nearest[~seen] < 0.6 - 0.06).any()
+
+
+def test_pictures_imaged_anew_have_speckle_of_their_own_and_the_volumes_moduli_stay(base):
+    first = load(base)
+    anew = first.with_values({"output.image_model": "rescatter", "space.tissue": "own"})
+    drawn = [drawn_space(anew, i, 5, 3) for i in (0, 1)]
+    assert drawn[0].phantom.seed != drawn[1].phantom.seed
+    assert all(d.tissue.young == first.tissue.young for d in drawn)
+    assert drawn_space(first, 0, 5, 3).tissue.young != first.tissue.young
+    homogeneous = drawn[0].with_values({"space.tissue": "homogeneous"})
+    new, other = (
+        imaged_space(s, base.parent)["image"]
+        for s in (homogeneous, drawn[0].with_values({"space.tissue": None, "output.image_model": "warp"}))
+    )
+    assert new.shape == other.shape
+    assert np.abs(new[0].astype(float) - other[0]).mean() > 5

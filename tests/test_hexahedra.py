@@ -204,3 +204,40 @@ def test_the_closed_form_is_what_elements_are_given_to_correct():
     )
     u = response.column_at(response.column(place, np.ones(1)), near)
     np.testing.assert_allclose(u, exact, atol=0.01 * np.abs(exact).max())
+
+
+@pytest.mark.parametrize(("least", "within"), [(10.0, 0.05), (0.0, None)], ids=["solid about it", "its own"])
+def test_a_force_in_fluid_moves_what_is_about_the_fluid(least, within):
+    """Against a spread load on fine elements, outside the fluid: the closed form of the fluid itself is too steep to be corrected."""
+    grid = SpatialGrid((5, 5, 5), (7.5, 7.0, 7.5), (-15.0, 0.0, -15.0))
+    clamps = Clamps.of(grid, ["left", "right", "bottom", "front", "back"])
+    ball, radius = Sphere((0.0, 13.0, 0.0), 4.0), 3.0
+    tissue = Tissue(10.0, 0.45, [Region(ball, 0.5, 0.49, "urine", fluid=True)])
+    place, force = np.array([[0.5, 12.5, 0.3]]), np.array([[0.1, 0.2, 0.0]])
+    low, high = grid.corners
+    lines = tuple(
+        graded(low[k], high[k], ball.centre[k] - 4.5, ball.centre[k] + 4.5, 2.0, 6.0) for k in range(3)
+    )
+    fine = Hexahedra(lines, tissue, clamps)
+    values = fine.solve(spread_load(fine, place, force, radius)[:, :, None])[:, :, 0]
+    p = np.random.default_rng(0).uniform(low + 1, high - 1, (800, 3))
+    outside = p[np.linalg.norm(p - ball.centre, axis=1) > 5.0]
+    response = SpatialFEMResponse(grid, clamps, tissue, cell=5.0, radius=radius, least=least)
+    error = off(
+        response.field_of([response.column(place, np.ones(1))], force)(outside), fine.at(values, outside)
+    )
+    assert error > 0.2 if within is None else error < within
+
+
+def test_stiffness_less_that_of_other_tissue_is_that_of_the_difference():
+    grid, clamps = block(SIZE, HELD["walls"])
+    lines = lines_for(grid, Tissue(), 6.0)
+    some = Hexahedra(lines, Tissue(10.0, 0.45, [Region(Layer(10.0, 20.0), 30.0)]), clamps)
+    for young, poisson in ((10.0, 0.45), (7.0, 0.3), (30.0, 0.45)):
+        less = some.difference(young, poisson)
+        other = Hexahedra(lines, Tissue(young, poisson), clamps)
+        np.testing.assert_allclose(
+            less.toarray(),
+            (some.stiffness - other.stiffness).toarray(),
+            atol=1e-12 * abs(some.stiffness).max(),
+        )

@@ -27,6 +27,9 @@ from echospline.laboratory.kidney_recipe import (
     PROBE,
     TISSUES,
 )
+from echospline.scenario import Scenario, open_spatial
+from echospline.scenario.run_space import run_space
+from echospline.scenario.space_models import build_spatial_model
 from echospline.scene import Floats, probe_plane
 
 SAMPLE_MODULE = import_module("echospline.laboratory.kidney")
@@ -335,3 +338,50 @@ def test_sample_kidney_by_its_name(patient: Kidney) -> None:
 def test_a_sample_with_another_name_gets_one_sentence() -> None:
     with pytest.raises(InputError, match="no sample volume 'lung'; expected one of: kidney, spine"):
         sample_volume("lung")
+
+
+def test_a_scene_takes_the_moduli_that_the_kidney_knows(patient: Kidney, tmp_path: Path) -> None:
+    plain = Scenario().with_values({"image.file": "sample:kidney"})
+    opened = open_spatial(plain, tmp_path)
+    points = np.random.default_rng(2).uniform((-50, 1, -28), (50, 88, 28), (4000, 3))
+    np.testing.assert_array_equal(opened.tissue.at(points)[0], patient.tissue.young_at(points))
+    assert opened.scenario.space is not None
+    assert opened.scenario.space.tissue == "own"
+    assert any("cortex 14" in note and "0.9 GB" in note for note in opened.notes)
+    for said in ({"space.tissue": "homogeneous"}, {"tissue.young": 7.0}):
+        even = open_spatial(plain.with_values(said), tmp_path)
+        assert even.tissue.homogeneous
+        assert even.scenario.space is not None
+        assert even.scenario.space.tissue == "homogeneous"
+    layered = {"tissue.region": [{"young": 30.0, "layer": [10, 20]}]}
+    assert len(open_spatial(plain.with_values(layered), tmp_path).tissue.regions) == 1
+    with pytest.raises(InputError, match="leave one of them out"):
+        open_spatial(plain.with_values({**layered, "space.tissue": "own"}), tmp_path)
+    with pytest.raises(InputError, match="sample:spine does not know the stiffness"):
+        open_spatial(Scenario().with_values({"image.file": "sample:spine", "space.tissue": "own"}), tmp_path)
+
+
+def test_the_kidney_is_imaged_anew_from_its_own_scatterers(patient: Kidney, tmp_path: Path) -> None:
+    said = {"image.file": "sample:kidney", "output.image_model": "rescatter", "space.probe.depth": 50.0}
+    opened = open_spatial(Scenario().with_values(said), tmp_path)
+    assert opened.form_image is not None
+    assert opened.scenario.space is not None
+    probe, plane = opened.scenario.space.probe.probe(), probe_plane((3.0, 0.0, 4.0), 20.0)
+    np.testing.assert_array_equal(
+        opened.form_image(plane, probe, None, 5).pixels,
+        patient.phantom.image_plane(plane, probe, noise_seed=5).pixels,
+    )
+
+
+def test_a_run_says_which_moduli_were_used(patient: Kidney, tmp_path: Path) -> None:
+    said = {
+        "image.file": "sample:kidney", "space.needle.depth": 6.0, "space.needle.dwell": 0.0, "output.fps": 2.0,
+        "output.figure": False,
+    }  # fmt: skip
+    for tissue, expected in (("own", "cortex 14"), ("homogeneous", "10 kPa everywhere")):
+        opened = open_spatial(Scenario().with_values({**said, "space.tissue": tissue}), tmp_path)
+        assert opened.scenario.space is not None
+        model = build_spatial_model(opened.scenario, opened.scenario.space.grid(opened.volume), opened.tissue)
+        report = run_space(opened.scenario, opened.volume, model, tmp_path / tissue, tmp_path)
+        assert expected in report["moduli"]
+        assert "closed form" in report["solved_by"]

@@ -169,6 +169,8 @@ def _fields(
     scene: scenario_room.Scenario, folder: Path, mesh: scene_room.RegularGrid, kind: str
 ) -> Callable[[study_room.Observation], study_room.UnitFields]:
     """Build the unit fields of the model of that name; its laws are those linear in the parameters."""
+    if scene.model.mechanics == "space":
+        raise InputError(study_room.IN_PLANE)
     built = scenario_room.build_model(
         scene.with_values({**study_room.PRINTED, "model.kind": kind}), mesh, folder=folder
     )

@@ -124,6 +124,7 @@ def _simulate_space(scenario: scenario_room.Scenario, folder: Path, out: Path, *
             out,
             folder,
             progress=lambda done, count: bar.update(task, completed=done, total=count),
+            form_image=opened.form_image,
         )
     say(report["doubts"])
     if as_json:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.mechanics.native import describe_core
     from echospline.mechanics.neo_hookean_model import NeoHookeanModel
     from echospline.mechanics.parameters import TPSParameters
+    from echospline.mechanics.plane_in_space import PlaneInSpace
     from echospline.mechanics.protocol import TissueModel
     from echospline.mechanics.spatial_force_model import SpatialForceModel
     from echospline.mechanics.spatial_landmark_model import SpatialLandmarkModel
@@ -35,6 +36,7 @@ __all__ = [
     "NeedleForces",
     "NeedleLoad",
     "NeoHookeanModel",
+    "PlaneInSpace",
     "Solver",
     "SpatialForceModel",
     "SpatialLandmarkModel",

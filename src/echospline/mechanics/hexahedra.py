@@ -88,6 +88,7 @@ class Hexahedra:
         self.lines, self.tissue, self.clamps = lines, tissue, clamps
         self.shape = tuple(2 * len(line) - 1 for line in lines)
         self.stiffness = self._assembled(tissue)
+        self._plain: dict[float, sparse.csc_matrix] = {}
 
     @property
     def size(self) -> int:
@@ -182,7 +183,9 @@ class Hexahedra:
 
     def difference(self, young: float, poisson: float) -> sparse.csr_matrix:
         """Stiffness less that of homogeneous tissue, N/mm: zero but in cells that differ from it."""
-        other = self._assembled(Tissue(young, poisson))
+        if poisson not in self._plain:  # stiffness is proportional to E: one matrix serves every modulus
+            self._plain[poisson] = self._assembled(Tissue(1.0, poisson))
+        other = self._plain[poisson] * young
         less = (self.stiffness - other).tocsr()
         scale = abs(other).max()
         less.data[np.abs(less.data) < 1e-12 * scale] = 0.0

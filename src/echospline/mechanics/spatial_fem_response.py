@@ -30,6 +30,8 @@ NEAR = 1.0
 """Of a cell's diagonal: a cell closer to a force than this is integrated point by point, one further away by its nodes."""
 FACE_GAUSS = 4
 """Points per direction on a free or sliding face."""
+KEPT = 3
+"""Moduli whose difference from the tissue is kept: in tissue that differs everywhere each takes as much as the stiffness matrix."""
 Material = tuple[float, float]
 """E in kPa and nu."""
 
@@ -76,6 +78,9 @@ class SpatialFEMResponse:
         Greatest size of a cell, about, mm.
     radius : float
         Over which a force of the needle is spread, mm.
+    least : float
+        Modulus in kPa that the closed form near a force has at least; elements correct what it is too much. A force in fluid, whose
+        own closed form is steeper than elements can correct, then moves what is about the fluid.
 
     Raises
     ------
@@ -91,6 +96,7 @@ class SpatialFEMResponse:
         *,
         cell: float = 3.5,
         radius: float = 0.7,
+        least: float = 0.0,
     ) -> None:
         ratios = [tissue.poisson, *(region.poisson for region in tissue.regions)]
         if not max(ratios) < 0.5:
@@ -109,13 +115,14 @@ class SpatialFEMResponse:
         if self.top is not None and abs(low[1]) > 1e-6:
             raise InputError(f"the surface of tissue in space is y = 0; the mesh begins at {low[1]:g} mm")
         self.grid, self.clamps, self.tissue, self.radius, self.cell = grid, clamps, tissue, radius, cell
+        self.least = least
         self.mesh = Hexahedra(lines_for(grid, tissue, cell), tissue, clamps)
         self._less: dict[Material, sparse.csr_matrix] = {}
         self.mesh.solve(np.zeros((self.mesh.size, 3, 1)))  # factors now
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle what the response was made of; a copy factors anew."""
-        made = partial(SpatialFEMResponse, cell=self.cell, radius=self.radius)
+        made = partial(SpatialFEMResponse, cell=self.cell, radius=self.radius, least=self.least)
         return made, (self.grid, self.clamps, self.tissue)
 
     def column(self, places: Floats, weights: Floats) -> SpatialColumn:
@@ -173,10 +180,12 @@ class SpatialFEMResponse:
         return f"closed forms near the needle and {cells} quadratic hexahedra of {size:.2g} mm or less for the rest, factored once"
 
     def _materials(self, places: Floats) -> dict[Material, Cells]:
-        """Which places lie in tissue of which E and nu."""
+        """Of which E and nu the closed form near each place is: those of the tissue there, but for ``least``."""
         if not len(places):
             return {}
-        material, which = np.unique(np.stack(self.tissue.at(places), axis=1), axis=0, return_inverse=True)
+        young, poisson = self.tissue.at(places)
+        near = np.stack([np.maximum(young, self.least), poisson], axis=1)
+        material, which = np.unique(near, axis=0, return_inverse=True)
         return {
             (float(E), float(nu)): np.flatnonzero(which.ravel() == k) for k, (E, nu) in enumerate(material)
         }
@@ -205,6 +214,8 @@ class SpatialFEMResponse:
         if self.tissue.homogeneous:
             return np.zeros((n, 3, 3))
         if material not in self._less:
+            while len(self._less) >= KEPT:
+                self._less.pop(next(iter(self._less)))
             self._less[material] = self.mesh.difference(*material)
         less = self._less[material]
         u = moves.reshape(3 * n, 3)

@@ -21,7 +21,7 @@ from echospline.mechanics.landmarks import Clamps
 from echospline.mechanics.response import SpatialColumn, SpatialResponse
 from echospline.mechanics.space_response import SpaceResponse
 from echospline.mechanics.spatial_fem_response import SpatialFEMResponse
-from echospline.mechanics.spread import radius_for
+from echospline.mechanics.spread import least_near, radius_for
 from echospline.mechanics.stick_slip import SlipState, Station, Track
 from echospline.scene import Floats, SpatialGrid, SpatialPose, Tissue
 
@@ -126,12 +126,9 @@ class SpatialForceModel:
         spread = radius_for(law, material, grid) if radius is None else radius
         if material.homogeneous:
             return cls(SpaceResponse(grid, clamps, material, radius=spread), law)
-        return cls(
-            SpatialFEMResponse(
-                grid, clamps, material, cell=cell_for(grid, LIVE_CELL, LIVE_NODES), radius=spread
-            ),
-            law,
-        )
+        cell = cell_for(grid, LIVE_CELL, LIVE_NODES)
+        least = least_near(material)
+        return cls(SpatialFEMResponse(grid, clamps, material, cell=cell, radius=spread, least=least), law)
 
     @classmethod
     def fem(
@@ -163,7 +160,8 @@ class SpatialForceModel:
         clamps = Clamps.of(grid, clamped, sliding=sliding)
         spread = radius_for(law, material, grid) if radius is None else radius
         size = cell_for(grid, FINE_CELL, FINE_NODES) if cell is None else cell
-        return cls(SpatialFEMResponse(grid, clamps, material, cell=size, radius=spread), law)
+        least = least_near(material)
+        return cls(SpatialFEMResponse(grid, clamps, material, cell=size, radius=spread, least=least), law)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle what the model was made of."""

@@ -24,13 +24,24 @@ HAT = 0.4
 """Of a station spacing, that the hat adds to the radius."""
 LEAST = 0.7
 """mm; a radius below it is steep for friction alone, and finer than the places of the hat."""
+SAID = 1.25
+"""Of the force at which |grad u| reaches 1, from which it is said: just below the surface a hat is cut short and seems to act over less
+than it does. Tissue folds at 1.5 or more."""
 WIDEST = 0.2
 """Of the least extent of the tissue: a force spread wider reaches the faces, where it is clamped or has an image."""
 
 
 def softest(tissue: Tissue) -> float:
-    """Least Young's modulus of tissue and regions, kPa."""
-    return min([tissue.young, *(region.young for region in tissue.regions)])
+    """Least Young's modulus of tissue and regions, kPa, but for fluids, which bear no needle."""
+    return min([tissue.young, *(region.young for region in tissue.regions if not region.fluid)])
+
+
+def least_near(tissue: Tissue) -> float:
+    """Return the least modulus of a closed form near a force, kPa: the softest solid's in tissue with fluids, else 0, which is none.
+
+    A force whose spread suits that solid would fold fluid by its own closed form, by more than elements can correct.
+    """
+    return softest(tissue) if any(region.fluid for region in tissue.regions) else 0.0
 
 
 def bearable(young: float, radius: float, spacing: float) -> float:
@@ -67,7 +78,7 @@ def folding(
     tissue: Tissue, radius: float, columns: Sequence[SpatialColumn], forces: Floats
 ) -> dict[str, str]:
     """Say where a force (k, 3) in N is more than tissue bears without |grad u| above 1; empty where none is."""
-    worst, said = 1.0, {}
+    worst, said = SAID, {}
     for column, f in zip(columns, forces, strict=True):
         if not len(column.places) or not f.any():
             continue

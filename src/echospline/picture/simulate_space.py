@@ -13,7 +13,7 @@ import numpy as np
 from echospline.errors import FoldingError, InputError
 from echospline.mechanics.protocol import SpatialTissueModel, State
 from echospline.picture.needle_echo import NeedleEcho
-from echospline.picture.slices import SliceDrawing, SpatialFolds, lattice_of
+from echospline.picture.slices import SliceDrawing, SliceFormer, SpatialFolds, lattice_of
 from echospline.scene import (
     Floats,
     ImagingPlane,
@@ -92,6 +92,7 @@ def simulate_space(
     longest_step: float = 1 / 30,
     folding: Literal["flag", "refuse"] = "flag",
     needle: NeedleEcho | None = None,
+    form_image: SliceFormer | None = None,
 ) -> Iterator[SpatialFrame]:
     """Push a needle into a volume while the probe moves.
 
@@ -115,6 +116,8 @@ def simulate_space(
         Whether a picture that folds is flagged in ``SpatialFrame.folds`` or ends the run.
     needle : NeedleEcho, optional
         Draws the needle's echo.
+    form_image : callable, optional
+        Forms the picture of deformed tissue; the default slices the volume (`slices.SliceFormer`).
 
     Yields
     ------
@@ -136,7 +139,7 @@ def simulate_space(
     duration = max(float(insertion.times[-1]) - first, float(planes.times[-1]) - first)
     count = int(duration * fps + 1e-9) + 1
     steps = max(1, ceil(1.0 / fps / longest_step - 1e-9))
-    drawing = SliceDrawing(volume, probe)
+    drawing = SliceDrawing(volume, probe, form_image)
     state = model.rest()
     for index in range(count):
         began = perf_counter()
@@ -148,7 +151,7 @@ def simulate_space(
         u = displaced(model.grid.nodes)
         interaction = 1e3 * (perf_counter() - began)
         plane = planes.at(first + index / fps)
-        drawn = drawing.draw(plane, displaced, pose, needle)
+        drawn = drawing.draw(plane, displaced, pose, needle, index)
         if drawn.folds and folding == "refuse":
             raise FoldingError(f"at {index / fps:.2f} s {drawn.folds}")
         yield SpatialFrame(

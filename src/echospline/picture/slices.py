@@ -36,6 +36,9 @@ from echospline.scene import (
 Field = Callable[[Floats], Floats]
 """Displacement (n, 3) mm of reference points (n, 3) mm."""
 
+SliceFormer = Callable[[ImagingPlane, Probe, Field | None, int], UltrasoundImage]
+"""Forms the picture of a plane on a probe's grid from the tissue's displacement (none: at rest); the number is the frame's, for its noise."""
+
 STEP = 8
 """Pixels between neighbours of the lattice."""
 CLOSE = 0.05
@@ -256,11 +259,13 @@ class SliceDrawing:
         Undeformed tissue, 8-bit voxels, in the scene's frame: y = 0 is the surface.
     probe : Probe
         Shape of the picture and thickness of the slice.
+    form_image : callable, optional
+        Forms pictures in place of slicing the volume (`SliceFormer`).
     """
 
-    def __init__(self, volume: Volume, probe: Probe) -> None:
-        self.volume, self.probe = volume, probe
-        self._voxels = NativeVolume(volume)
+    def __init__(self, volume: Volume, probe: Probe, form_image: SliceFormer | None = None) -> None:
+        self.volume, self.probe, self._former = volume, probe, form_image
+        self._voxels = None if form_image else NativeVolume(volume)
         grid = probe.grid
         columns, rows = grid.shape
         self._lattice = lattice_of(probe)
@@ -278,6 +283,7 @@ class SliceDrawing:
         field: Field | None = None,
         pose: SpatialPose | None = None,
         needle: NeedleEcho | None = None,
+        index: int = 0,
     ) -> SliceDrawn:
         """Draw the picture of a plane.
 
@@ -291,6 +297,8 @@ class SliceDrawing:
             The needle.
         needle : NeedleEcho, optional
             Its looks; not drawn when not given.
+        index : int
+            Number of the frame: what ``form_image`` draws anew for each.
         """
         began = perf_counter()
         grid, lattice = self.probe.grid, self._lattice
@@ -300,9 +308,16 @@ class SliceDrawing:
             X, residual, folds = self._undo(places, field, pose)
         inverse = perf_counter()
         shape = (*lattice.shape[::-1], 3)
-        pixels, outside = self._voxels.slice(
-            X.reshape(shape), grid.shape, STEP, plane.matrix[:3, 2], self._spread, self.probe.mask
-        )
+        if self._voxels is not None:
+            pixels, beyond = self._voxels.slice(
+                X.reshape(shape), grid.shape, STEP, plane.matrix[:3, 2], self._spread, self.probe.mask
+            )
+            outside = beyond / max(int(self.probe.mask.sum()), 1)
+        else:
+            assert self._former is not None
+            pixels = self._former(plane, self.probe, field, index).pixels
+            seen = self.probe.sees(lattice.nodes)
+            outside = 1.0 - float(self.volume.contains(X[seen]).mean()) if seen.any() else 0.0
         sliced = perf_counter()
         if pose is not None and needle is not None and pose.depth >= ZERO_LENGTH:
             self._picture.reference(pixels)
@@ -314,7 +329,7 @@ class SliceDrawing:
             X.reshape(shape),
             residual,
             folds,
-            outside / max(int(self.probe.mask.sum()), 1),
+            outside,
             {
                 "inverse": 1e3 * (inverse - began),
                 "slice": 1e3 * (sliced - inverse),

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from echospline.menu import on_demand
 
 if TYPE_CHECKING:  # the menu, loaded on demand
-    from echospline.scenario.models import MODELS, build_model
+    from echospline.scenario.models import build_model
     from echospline.scenario.run import run
     from echospline.scenario.scale import (
         PHANTOM,
@@ -16,6 +16,7 @@ if TYPE_CHECKING:  # the menu, loaded on demand
     )
     from echospline.scenario.scenario import LARGEST_FILE, Scenario, describe, load, validated
     from echospline.scenario.sections import DiscSection, ExerciseSection
+    from echospline.scenario.space_models import MODELS
     from echospline.scenario.space_scene import is_spatial, open_spatial
 else:
     on_demand(__name__)

@@ -26,9 +26,8 @@ from echospline.mechanics import (
 from echospline.mechanics.protocol import TissueModel
 from echospline.scenario.scenario import Scenario
 from echospline.scenario.sections import ForceSection
+from echospline.scenario.space_models import MODELS, build_slab_model
 from echospline.scene import RegularGrid
-
-MODELS = ("tps", "elastic", "green", "fem")
 
 
 def build_model(
@@ -54,6 +53,8 @@ def build_model(
     """
     kind = kind or scenario.model.kind
     tissue = scenario.make_tissue(folder or Path(), grid)
+    if scenario.model.mechanics == "space":
+        return build_slab_model(scenario, grid, tissue, kind)
     neo_hookean = scenario.tissue.material == "neo-hookean"
     if neo_hookean and kind in MODELS and kind != "fem":
         raise InputError(

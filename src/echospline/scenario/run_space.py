@@ -21,11 +21,12 @@ from echospline.io import open_writer
 from echospline.io.displacement_space import SpatialDisplacementWriter
 from echospline.io.sequence import SequenceWriter
 from echospline.mechanics import describe_core
-from echospline.mechanics.protocol import SpatialTissueModel, State
+from echospline.mechanics.protocol import SpatialTissueModel, State, described
 from echospline.picture.simulate_space import SpatialFrame, simulate_space
-from echospline.picture.slices import lattice_of
+from echospline.picture.slices import SliceFormer, lattice_of
 from echospline.scenario.run import SUFFIX, package_versions
 from echospline.scenario.scenario import Scenario
+from echospline.scenario.space_scene import moduli
 from echospline.scene import RegularGrid, Volume
 
 FAR_OUT = 0.5
@@ -104,6 +105,7 @@ def run_space(
     *,
     progress: Callable[[int, int], None] | None = None,
     doubts: Sequence[str] = (),
+    form_image: SliceFormer | None = None,
 ) -> dict[str, Any]:
     """Simulate a scenario in space and write its results.
 
@@ -123,6 +125,8 @@ def run_space(
         Called with (frames done, number of frames).
     doubts : sequence of str
         What was said before the run.
+    form_image : callable, optional
+        See `simulate_space`; `space_former.former_of` makes that of a scenario.
 
     Returns
     -------
@@ -155,7 +159,7 @@ def run_space(
         sinks = [_sink(stack, name, out, probe.grid, output.fps) for name in dict.fromkeys(output.formats)]
         for frame in simulate_space(
             volume, probe, planes, insertion, model, fps=output.fps, longest_step=output.longest_step,
-            folding=output.folding, needle=scenario.needle_echo(),
+            folding=output.folding, needle=scenario.needle_echo(), form_image=form_image,
         ):  # fmt: skip
             since = perf_counter()
             for sink in sinks:
@@ -177,6 +181,8 @@ def run_space(
         from echospline.picture.summary_space import summary_figure_space  # noqa: PLC0415
 
         title = scenario.title or f"{scenario.model.kind} in space: {volume.source}"
+        said = moduli_of(model)
+        title += f"\nYoung's modulus: {said}" if said else ""
         summary_figure_space(volume, probe, tally.first, tally.shown, out / "summary.png", title=title)
         files.append("summary.png")
     scenario.save(out / "scenario.toml", folder)
@@ -188,6 +194,9 @@ def run_space(
             "spacing_mm": list(volume.spacing),
         },
         "model": scenario.model.kind,
+        **({"solved_by": solved} if (solved := described(model)) else {}),
+        **({"moduli": said} if (said := moduli_of(model)) else {}),
+        "image_model": output.image_model,
         "mesh_nodes": model.grid.size,
         **tally.report(),
         "doubts": [*doubts, *tally.doubts()],
@@ -204,3 +213,12 @@ def run_space(
     with appearing(out / "run.json") as part:
         part.write_text(json.dumps(report, indent=2), encoding="utf-8")
     return report
+
+
+def moduli_of(model: object) -> str:
+    """Return the moduli that a model computes with, kPa; empty where it has none (landmarks in homogeneous tissue)."""
+    response = getattr(model, "response", None)
+    tissue = getattr(response if response is not None else model, "tissue", None)
+    if tissue is None or (response is None and tissue.homogeneous):
+        return ""
+    return moduli(tissue)

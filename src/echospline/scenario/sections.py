@@ -137,6 +137,10 @@ class MeshSection(Section):
         description="edges that move along themselves alone: the skin under the probe; any other edge is free",
     )
     clamped_points: list[Point] = Field(default=[], description="further points held fast, mm")
+    sides: Literal["clamped", "sliding", "free"] = Field(
+        "clamped",
+        description="mechanics space: what holds the slab in front of the picture and behind it, half of tissue.thickness away",
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -349,6 +353,10 @@ class ModelSection(Section):
 
     kind: Literal["tps", "elastic", "green", "fem"] = Field(
         "green", description="green, tps (paper), elastic or fem"
+    )
+    mechanics: Literal["plane", "space"] = Field(
+        "plane",
+        description="of a picture: plane elasticity (paper), or a slab of tissue.thickness in space whose middle it is",
     )
     landmarks: LandmarkSection = Field(default_factory=LandmarkSection)
     elastic: ElasticSection = Field(default_factory=ElasticSection)

@@ -8,11 +8,15 @@ from pathlib import Path
 import numpy as np
 
 from echospline.errors import InputError
+from echospline.picture.slices import SliceFormer
 from echospline.scenario.scenario import Scenario
+from echospline.scenario.sections import TissueSection
+from echospline.scenario.space_former import former_notes, former_of
 from echospline.scenario.space_section import SpaceSection
-from echospline.scene import Layer, Region, Tissue, Volume
+from echospline.scene import Layer, Region, Tissue, Volume, VolumeLabel
 
-SAMPLES = ("sample:kidney", "sample:spine")
+KIDNEY = "sample:kidney"
+SAMPLES = (KIDNEY, "sample:spine")
 
 
 @dataclass(frozen=True)
@@ -29,12 +33,15 @@ class SpatialScene:
         Its material.
     notes : tuple of str
         What was chosen or could not be followed.
+    form_image : callable, optional
+        What images the tissue anew in every frame; none where the volume is sliced.
     """
 
     scenario: Scenario
     volume: Volume
     tissue: Tissue
     notes: tuple[str, ...]
+    form_image: SliceFormer | None = None
 
 
 def is_spatial(scenario: Scenario) -> bool:
@@ -53,14 +60,16 @@ def open_spatial(scenario: Scenario, folder: Path) -> SpatialScene:
     space = scenario.space or SpaceSection()
     name = scenario.image.file
     notes: list[str] = []
-    if name in SAMPLES:
+    made = None
+    if name == KIDNEY:
+        from echospline.laboratory.kidney import kidney  # noqa: PLC0415
+
+        made = kidney()
+        volume = made.volume
+    elif name in SAMPLES:
         from echospline.laboratory.sample_volumes import sample_volume  # noqa: PLC0415
 
-        volume, tissue = sample_volume(name.removeprefix("sample:"))
-        if tissue is not None:
-            notes.append(
-                f"{name} knows the stiffness of every tissue; the model takes one, tissue.young = {scenario.tissue.young:g} kPa"
-            )
+        volume, _ = sample_volume(name.removeprefix("sample:"))
     else:
         from echospline.io.volume_reading import read_volume  # noqa: PLC0415
 
@@ -72,12 +81,57 @@ def open_spatial(scenario: Scenario, folder: Path) -> SpatialScene:
         )
     volume, space, said = _windowed(volume, space)
     notes += said
+    own = _takes_own(scenario, space, known=made is not None)
+    space = space.model_copy(update={"tissue": "own" if own else "homogeneous"})
     resolved = scenario.model_copy(update={"space": space})
-    return SpatialScene(resolved, volume, spatial_tissue(scenario), tuple(notes))
+    tissue = spatial_tissue(scenario)
+    if own and made is not None:
+        from echospline.laboratory.stiffness import tissue_of  # noqa: PLC0415
+
+        tissue = tissue_of(made.tissue, scenario.tissue.poisson)
+        notes.append(
+            f"every tissue of {name} has a modulus of its own ({moduli(tissue)}): green takes some 4 s and 0.9 GB to set up, fem 15 s and 3 GB; "
+            "--tissue homogeneous takes tissue.young alone"
+        )
+    notes += former_notes(resolved, made)
+    return SpatialScene(resolved, volume, tissue, tuple(notes), former_of(resolved, volume, made))
+
+
+def moduli(tissue: Tissue) -> str:
+    """Name the moduli of a tissue in one line: kinds, softest first, with E in kPa."""
+    if not tissue.regions:
+        return f"{tissue.young:g} kPa everywhere"
+    named = [(r.young, r.name or f"region {i}") for i, r in enumerate(tissue.regions)]
+    if not any(isinstance(r.shape, VolumeLabel) for r in tissue.regions):  # labels name every voxel
+        named.append((tissue.young, "the rest"))
+    return ", ".join(f"{name} {young:,g}" for young, name in sorted(named)) + " kPa"
+
+
+def _takes_own(scenario: Scenario, space: SpaceSection, *, known: bool) -> bool:
+    """Return whether the volume's own moduli are taken.
+
+    Raises
+    ------
+    InputError
+        If they are asked for, and the volume knows none or the scenario gives layers beside them.
+    """
+    said, plain = scenario.tissue, TissueSection()
+    if space.tissue == "own" and not known:
+        raise InputError(
+            f'space.tissue = "own": {scenario.image.file} does not know the stiffness of its tissues; {KIDNEY} does: give tissue.young and '
+            "layers (tissue.region)"
+        )
+    if space.tissue == "own" and said.region:
+        raise InputError(
+            'space.tissue = "own" takes the moduli of the volume; tissue.region would replace them: leave one of them out'
+        )
+    if space.tissue is not None or not known:
+        return space.tissue == "own"
+    return said.young == plain.young and not said.region
 
 
 def spatial_tissue(scenario: Scenario) -> Tissue:
-    """Build the tissue in space: homogeneous, or with layers by depth.
+    """Build the tissue of a scenario's words in space: homogeneous, or with layers by depth.
 
     Raises
     ------

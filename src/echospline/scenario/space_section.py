@@ -147,6 +147,11 @@ class SpaceSection(Section):
     window: tuple[float, float] | None = Field(
         None, description="values shown as black and white; from least to greatest where voxels need one"
     )
+    tissue: Literal["own", "homogeneous"] | None = Field(
+        None,
+        description="own: the modulus of every tissue, where the volume knows it (sample:kidney); homogeneous: tissue.young and the layers of "
+        "tissue.region; where not given, own unless the scenario says a modulus or a layer",
+    )
     mesh: SpaceMeshSection = Field(default_factory=SpaceMeshSection)
     probe: SpaceProbeSection = Field(
         default_factory=SpaceProbeSection,

@@ -18,6 +18,7 @@ if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.scene.tissue import (
         Box,
         Circle,
+        Extruded,
         Label,
         Layer,
         Polygon,
@@ -47,6 +48,7 @@ __all__ = [
     "Display",
     "Echo",
     "EchoCine",
+    "Extruded",
     "FieldError",
     "Floats",
     "ImagingPlane",

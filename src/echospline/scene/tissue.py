@@ -174,13 +174,30 @@ class VolumeLabel:
 
 
 @dataclass(frozen=True)
+class Extruded:
+    """A shape of the plane continued along z: everything whose (x, y + ``surface``) lies in it."""
+
+    shape: Shape
+    surface: float = 0.0
+
+    def contains(self, points: Floats) -> Mask:
+        """Test which points (n, 3) belong to it."""
+        _refuse_other(points, 3, "an extruded shape", "the shape itself")
+        return self.shape.contains(points[:, :2] + [0.0, self.surface])
+
+
+@dataclass(frozen=True)
 class Region:
-    """Part of the tissue that differs: its shape, Young's modulus (kPa), Poisson's ratio and name."""
+    """Part of the tissue that differs: its shape, Young's modulus (kPa), Poisson's ratio and name.
+
+    A fluid (urine, blood) is as soft as its modulus says, but the needle's forces are not spread so wide that it alone would bear them.
+    """
 
     shape: Shape
     young: float
     poisson: float = 0.45
     name: str = ""
+    fluid: bool = False
 
     def __post_init__(self) -> None:
         _check(self.young, self.poisson, f"region {self.name!r}" if self.name else "a region")

@@ -6,7 +6,7 @@ from echospline.menu import on_demand
 
 if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.study.bench import benchmark
-    from echospline.study.calibrate import PRINTED, calibrate
+    from echospline.study.calibrate import IN_PLANE, PRINTED, calibrate
     from echospline.study.charts_exvivo import error_per_depth, motion_maps
     from echospline.study.dataset import (
         create_store,
@@ -26,6 +26,7 @@ else:
 
 __all__ = [
     "FULL",
+    "IN_PLANE",
     "PRINTED",
     "QUICK",
     "Fit",

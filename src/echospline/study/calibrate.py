@@ -33,6 +33,9 @@ PRINTED: Mapping[str, Any] = {
 }
 """The laws under which fields are linear in the parameters."""
 
+IN_PLANE = 'parameters are identified in the plane or in a scene with [space]: give a scenario with model.mechanics = "plane"'
+"""What is said to scenarios whose picture is the middle of a slab in space."""
+
 
 def calibrate(
     *,
@@ -139,6 +142,8 @@ def _calibrated(
         return _calibrated_in_space(
             path, folder, source, scene, kind, objective, confidence, frames, bootstrap, seed
         )
+    if scene.model.mechanics == "space":
+        raise InputError(IN_PLANE)
     if method not in ("closed", "grid"):
         raise InputError(f'method is "closed" or "grid"; got {method!r}')
     scene = scene.with_values({**PRINTED, "model.kind": kind})

@@ -31,7 +31,8 @@ class SpatialVariation:
     Parameters
     ----------
     young, tip_force, friction : (float, float)
-        Factors on the base's value, drawn evenly in the logarithm.
+        Factors on the base's value, drawn evenly in the logarithm. Tissue is homogeneous or layered as the base's [tissue] says; a base with
+        ``space.tissue = "own"`` keeps the moduli of its volume, and ``young`` does nothing.
     entry : (float, float)
         mm added to the needle's entry, along x and along z.
     turn : (float, float)
@@ -111,6 +112,10 @@ def drawn_space(
         # the last frame is the end of the insertion
         "output.fps": (frames - 1) / (float(depth) / speed) * (1.0 + 1e-9),
     }
+    if space.tissue == "own":
+        del values["tissue.young"]
+    if base.output.image_model == "rescatter":  # every sample has speckle of its own
+        values["phantom.seed"] = int(rng.integers(2**31))
     scenario = base.with_values(values, f"sample {index}")
     assert scenario.space is not None
     across = rng.random() < v.across
@@ -190,7 +195,7 @@ def imaged_space(scenario: Scenario, folder: Path) -> dict[str, NDArray[Any]]:
     first: SpatialFrame | None = None
     for frame in simulate_space(
         opened.volume, probe, space.probe.planes(insertion), insertion, model, fps=scenario.output.fps,
-        longest_step=scenario.output.longest_step, needle=scenario.needle_echo(),
+        longest_step=scenario.output.longest_step, needle=scenario.needle_echo(), form_image=opened.form_image,
     ):  # fmt: skip
         first = first or frame
         seen = frame.seen_from(first, probe, opened.volume)
