@@ -21,7 +21,7 @@ def study(
         "out/study"
     ),
     quick: Annotated[
-        bool, typer.Option("--quick", help="two to four minutes: fewer depths, meshes and runs")
+        bool, typer.Option("--quick", help="one to three minutes: fewer depths, meshes and runs")
     ] = False,
     seed: Annotated[int, typer.Option("--seed", min=0, help="of the searches")] = 0,
     workers: Annotated[
