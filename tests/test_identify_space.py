@@ -149,3 +149,23 @@ def test_the_methods_of_the_plane_are_refused(scene):
         done = CliRunner().invoke(app, ["identify", str(scene / "run"), "--out", str(scene / "x"), *words])
         assert done.exit_code != 0
         assert "leave out --method and --needle" in str(done.exception) + done.output
+
+
+@pytest.mark.parametrize("kind", ["elastic", "tps"])
+def test_landmark_models_give_back_what_the_data_determine_and_name_what_they_do_not(opened, kind):
+    true = {"sigma": 0.8, "alpha1": 0.3, "alpha2": 0.2}
+    start = {"sigma": 0.5, "alpha1": 0.5, "alpha2": 0.1}
+    coarse = opened.scenario.with_values({"model.kind": kind, "space.mesh.nodes": [7, 7, 7]})
+    grid = coarse.space.grid(opened.volume)
+    points = lattice_of(coarse.space.probe.probe()).nodes[::7]
+    times, chosen = np.arange(0, 2.01, 0.2), np.array([2, 4, 6, 8])
+    empty = SeenRun(points, times, chosen, np.zeros((4, len(points), 2)))
+    u = PictureRuns(coarse, grid, opened.tissue, empty).run(true)
+    begun = coarse.with_values({f"model.landmarks.{n}": v for n, v in start.items()})
+    seen = SeenRun(points, times, chosen, u)
+    found = fit_in_space(PictureRuns(begun, grid, opened.tissue, seen), "rmse", bootstrap=0)
+    assert found.error.rmse < 1e-3
+    assert found.values["sigma"] == pytest.approx(true["sigma"], rel=1e-3)
+    # friction (15) at the axis is alpha1 + alpha2 / 2: the contacts lie there
+    assert found.values["alpha1"] + found.values["alpha2"] / 2 == pytest.approx(0.4, rel=0.01)
+    assert any("alpha1 and alpha2 cannot be told apart" in sentence for sentence in found.confounded)

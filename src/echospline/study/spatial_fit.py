@@ -22,6 +22,7 @@ from echospline.scenario import Scenario
 from echospline.scenario.space_models import build_spatial_model
 from echospline.scene import MOVED, Floats, SpatialGrid, Tissue, distance, field_error
 from echospline.study.identify import (
+    CONFOUNDED,
     Identification,
     Objective,
     confounding,
@@ -40,8 +41,10 @@ BESIDE = 0.05
 """Share of a parameter by which it is changed to see its effect: less is lost in where tissue begins to slip, more is not the slope."""
 FURTHEST = 3.0
 """Factor by which a parameter may change in one step: beyond, the field is not linear."""
-CLOSE = 2e-3
-"""Relative change of the error below which the search ends."""
+WELL = 0.1
+"""Share by which the error has to fall in the directions that the observation determines, or all directions are tried as well."""
+CLOSE, EXACT = 2e-3, 1e-5
+"""Relative change of the error, and its share of the motion, below which the search ends."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +155,7 @@ def fit_in_space(
     objective : {"mae", "rmse"}
         The error to minimise, equation (24).
     start : mapping, optional
-        Where to begin; the scenario's own values when not given. One that is 0 begins at 0.001: a step only multiplies.
+        Where to begin; the scenario's own values when not given. One that is 0 or less begins at 0.001: a step only multiplies.
     most : int
         Steps at most.
     bootstrap : int
@@ -192,22 +195,24 @@ def fit_in_space(
     scale = float(distance(observed, np.zeros_like(observed))[seen].mean())
     for step in range(most):
         slopes = _slopes(runs, values, field + still)
-        rest = (observed - field)[seen] + slopes[seen] @ np.array([values[n] for n in names])
-        x = least_distances(slopes[seen], rest, np.ones(int(seen.sum())), objective, 1e-6 * scale, 1e-6)
-        low, high = (np.array([values[n] * f for n in names]) for f in (1 / FURTHEST, FURTHEST))
-        aim = dict(zip(names, map(float, np.clip(x, low, high)), strict=True))
-        before, better = cost, False
-        for part in (1.0, 0.5, 0.25, 0.125):
-            trial = {n: values[n] + part * (aim[n] - values[n]) for n in names}
-            new, new_cost = simulated(trial)
-            if new_cost < cost:
-                field, cost, values, better = new, new_cost, trial, True
+        at, before = np.array([values[n] for n in names]), cost
+        missing, even = (observed - field)[seen], np.ones(int(seen.sum()))
+        for basis in _bases(slopes[seen], at):
+            along = least_distances(slopes[seen] @ basis, missing, even, objective, 1e-6 * scale, 1e-6)
+            move = _reached(at, basis @ along)
+            for part in (1.0, 0.5, 0.25, 0.125):
+                trial = dict(zip(names, map(float, at + part * move), strict=True))
+                new, new_cost = simulated(trial)
+                if new_cost < cost:
+                    field, cost, values = new, new_cost, trial
+                    break
+            if before - cost > WELL * before:
                 break
         if report is not None:
             report(
                 f"step {step + 1}: {objective} {cost:.4f} mm, {', '.join(f'{n} {v:.4g}' for n, v in values.items())}"
             )
-        if not better or before - cost < CLOSE * before:
+        if before - cost < CLOSE * before or cost < EXACT * scale:
             break
     slopes = _slopes(runs, values, field + still)
     seconds = perf_counter() - began
@@ -225,6 +230,30 @@ def fit_in_space(
         runs.runs,
         seconds,
     )
+
+
+def _bases(slopes: Floats, values: Floats) -> list[Floats]:
+    """Return directions (p, k) for a step: those that the observation determines first, then all.
+
+    Parameters
+    ----------
+    slopes : ndarray, shape (m, 2, p)
+        Field per unit of each parameter.
+    values : ndarray, shape (p,)
+        The parameters, which scale the directions.
+    """
+    J = slopes.reshape(-1, len(values)) * values
+    eigenvalues, vectors = np.linalg.eigh(J.T @ J)
+    singular = np.sqrt(np.maximum(eigenvalues, 0.0))
+    kept = singular * CONFOUNDED >= singular[-1]
+    whole = np.diag(values)
+    return [whole] if kept.all() else [whole @ vectors[:, kept], whole]
+
+
+def _reached(values: Floats, move: Floats) -> Floats:
+    """Shorten a move of parameters (p,) so that none changes by more than `FURTHEST`; it keeps its direction."""
+    limit = np.where(move > 0, (FURTHEST - 1.0) * values, (1.0 - 1.0 / FURTHEST) * values)
+    return move * min(1.0, float((limit / np.maximum(np.abs(move), 1e-300)).min()))
 
 
 def _slopes(runs: PictureRuns, values: Mapping[str, float], field: Floats) -> Floats:
