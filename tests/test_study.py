@@ -18,6 +18,7 @@ from echospline.study import study, table, write_report
 from echospline.study.accuracy import CLAMPED, HELD_OUT, Case, brute_force, observe, oracle
 from echospline.study.claims import claims
 from echospline.study.paper import Extent
+from echospline.study.plane_space import SPACE_SCENES
 from echospline.study.scenes import MODELS, SCENES
 from echospline.study.speed import mesh_of, savings
 
@@ -30,6 +31,7 @@ TINY = Extent(
     runs=8,
     frames=2,
     radii=(1.0,),
+    cell=9.0,
 )
 
 
@@ -47,7 +49,7 @@ def test_every_file_is_there_and_whole(done):
         with Image.open(out / f"{name}.png") as picture:
             picture.verify()
         assert "</svg>" in (out / f"{name}.svg").read_text()[-20:]
-    for name in ("accuracy", "scenes", "linearity", "speed", "savings"):
+    for name in ("accuracy", "scenes", "linearity", "plane_space", "speed", "savings"):
         rows = json.loads((out / f"{name}.json").read_text())
         with (out / f"{name}.csv").open(newline="") as file:
             assert len(list(csv.DictReader(file))) == len(rows) > 0
@@ -126,12 +128,13 @@ def test_report_is_one_self_contained_page(done):
 
 def test_a_second_run_takes_the_cases_from_the_disk(done, tmp_path):
     out, result, said = done
-    assert sum(line.startswith("accuracy:") for line in said) == 9 + len(SCENES)
+    assert sum(line.startswith("accuracy:") for line in said) == 9 + len(SCENES) + len(SPACE_SCENES)
     again = []
     repeated = study(out, TINY, seed=1, report=again.append)
     assert not any(line.startswith("accuracy:") for line in again)
     assert repeated["accuracy"] == result["accuracy"]
     assert repeated["scenes"] == result["scenes"]
+    assert repeated["plane_space"] == result["plane_space"]
 
 
 def test_oracle_landmarks_bound_what_any_law_can_reach():

@@ -19,7 +19,8 @@ equation  content                                                           code
 (24)      mean absolute and root mean square error                          `scene.metrics`
 ========  ================================================================  ==========================================
 
-Lengths are mm, times s, forces N, moduli kPa; points (x lateral, y depth); displacement is deformed minus reference.
+Lengths are mm, times s, forces N, moduli kPa; points (x lateral, y depth); displacement is deformed minus reference. In space z is elevation, and
+`simulate` takes a `Volume`, a `Probe` and its plane: `docs/space.md`.
 """
 
 from typing import TYPE_CHECKING
@@ -40,10 +41,24 @@ if TYPE_CHECKING:  # the menu, loaded on demand
         ViscousForces,
     )
     from echospline.mechanics.protocol import TissueModel
+    from echospline.mechanics.spatial_force_model import SpatialForceModel
     from echospline.picture import Deformation, Frame, NeedleEcho, simulate, warp
     from echospline.scenario import Scenario
     from echospline.scenario import load as load_scenario
-    from echospline.scene import Cine, Insertion, NeedlePose, RegularGrid, Tissue, UltrasoundImage
+    from echospline.scene import (
+        Cine,
+        ImagingPlane,
+        Insertion,
+        NeedlePose,
+        PlanePath,
+        Probe,
+        RegularGrid,
+        SpatialInsertion,
+        Tissue,
+        UltrasoundImage,
+        Volume,
+        probe_plane,
+    )
 else:
     on_demand(__name__)
 
@@ -56,15 +71,20 @@ __all__ = [
     "FoldingError",
     "Frame",
     "GreenModel",
+    "ImagingPlane",
     "InputError",
     "Insertion",
     "MissingExtraError",
     "NeedleEcho",
     "NeedleForces",
     "NeedlePose",
+    "PlanePath",
+    "Probe",
     "RegularGrid",
     "Scenario",
     "SolverError",
+    "SpatialForceModel",
+    "SpatialInsertion",
     "TPSModel",
     "TPSParameters",
     "ThinPlate",
@@ -72,9 +92,11 @@ __all__ = [
     "TissueModel",
     "UltrasoundImage",
     "ViscousForces",
+    "Volume",
     "load_scenario",
     "open_cine",
     "open_writer",
+    "probe_plane",
     "read",
     "read_displacement",
     "read_image",

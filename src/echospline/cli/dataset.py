@@ -40,7 +40,9 @@ def dataset(
 
     Tissue, probe, needle path and speckle are drawn around the bases; sample i depends on its base, i and the seed alone,
     and `scenarios/0000000.toml` makes it again (`echospline phantom`). An interrupted run resumes,
-    and a larger --n adds samples.
+    and a larger --n adds samples. Bases in space ([space], or an image sample:kidney or sample:spine) make sequences of a probe that is held along or
+    across the needle and drifts: the truth is the motion in the picture and out of it, and where tissue has left the slice
+    (`echospline simulate` makes such a sample again).
     """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -49,15 +51,17 @@ def dataset(
         bases = [str(path.resolve()) for path in scenarios or [own]]
         loaded = [(Path(base), scenario_room.load(base)) for base in bases]
         for base, first in loaded:
+            if scenario_room.is_spatial(first):
+                continue
             say((f"{base.name}: {note}" for note in first.label_notes(base.parent)), "note")
             say(scenario_room.needle_doubts(first.insertion(), first.phantom.grid()))
-        shapes = {(first.phantom.grid().shape, first.mesh.nodes) for _, first in loaded}
-        (nx, ny), (mx, my) = next(iter(shapes))
-        if len(shapes) > 1:
+        layouts = [study_room.sample_arrays(first, frames) for _, first in loaded]
+        if any(layout != layouts[0] for layout in layouts):
             raise InputError(
-                "all bases of a dataset need the same phantom.size, phantom.pixel and mesh.nodes"
+                "all bases of a dataset need the same phantom.size, phantom.pixel and mesh.nodes; in space the same shape of the probe's "
+                "picture, and bases are all in the plane or all in space"
             )
-        say(scenario_room.check_store(n, frames * (2 * nx * ny + 8 * mx * my + 48), out))
+        say(scenario_room.check_store(n, study_room.sample_bytes(loaded[0][1], frames), out))
         began = perf_counter()
         with claimed(out):
             # names, not paths: the dataset is the same wherever it is made

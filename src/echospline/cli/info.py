@@ -13,6 +13,14 @@ import numpy as np
 import typer
 
 from echospline import scenario as scenario_room
+from echospline.cli.info_space import (
+    SAMPLE_VOLUMES,
+    of_file_volume,
+    of_sample_volume,
+    of_space_record,
+    of_space_scenario,
+    of_tracked,
+)
 from echospline.errors import InputError
 from echospline.io import (
     LIMIT,
@@ -22,11 +30,13 @@ from echospline.io import (
     Recording,
     decoding,
     displacement_shapes,
+    is_spatial_record,
     kind_of,
     list_arrays,
     open_echoes,
     open_recording,
     read_displacement,
+    read_spatial_displacement,
     sample_image,
 )
 from echospline.scene import RegularGrid
@@ -40,7 +50,7 @@ def info(
         str,
         typer.Argument(
             help="Image, cine, DICOM, RF data, scenario, or a result of echospline: its folder, run.json, displacement.npz, "
-            "echoes.npz, a track; sample:calf is the image that ships with echospline.",
+            "echoes.npz, a track; sample:calf, sample:kidney and sample:spine come with echospline.",
             show_default=False,
         ),
     ],
@@ -92,7 +102,8 @@ def describe(file: str, limit: float = LIMIT) -> dict[str, Any]:
         If the file is missing, damaged, too large or of no known kind.
     """
     if file.startswith(SAMPLE):
-        return _of_sample(file.removeprefix(SAMPLE))
+        name = file.removeprefix(SAMPLE)
+        return of_sample_volume(name) if name in SAMPLE_VOLUMES else _of_sample(name)
     if not file.strip():
         raise InputError("expected a file or folder; got an empty name")
     path = Path(file)
@@ -107,7 +118,14 @@ def describe(file: str, limit: float = LIMIT) -> dict[str, Any]:
     elif kind in ("toml", "arrays"):
         about |= _of_toml(path) if kind == "toml" else _of_arrays(path)
     else:
-        about |= _of_recording(_header(path, limit), limit)
+        recording = _header(path, limit)
+        about |= _of_recording(recording, limit)
+        more: dict[str, Any] = {}
+        if recording.volume:
+            more = of_file_volume(path, limit)
+        elif kind in ("metaimage", "nrrd"):
+            more = of_tracked(path)
+        about |= more | {"notes": [*about.pop("notes"), *more.get("notes", [])]}
     return about
 
 
@@ -150,7 +168,11 @@ def _of_report(report: dict[str, Any], folder: Path) -> dict[str, Any]:
         "format": "report of a run",
         "made": report.get("made"),
         "image": picture.get("source"),
-        "spacing_mm": picture.get("spacing_mm"),
+        **(
+            {"voxels": picture["voxels"], "voxel_mm": picture.get("spacing_mm")}
+            if "voxels" in picture
+            else {"spacing_mm": picture.get("spacing_mm")}
+        ),
         "model": report["model"],
         "frames": report["frames"],
         "largest_displacement_mm": report.get("largest_displacement_mm"),
@@ -227,7 +249,8 @@ def _of_arrays(path: Path) -> dict[str, Any]:
 
 def _of_sample(name: str) -> dict[str, Any]:
     if name not in SAMPLES:
-        raise InputError(f"there is no sample {name!r}; expected one of: {', '.join(SAMPLES)}")
+        known = ", ".join((*SAMPLES, *SAMPLE_VOLUMES))
+        raise InputError(f"there is no sample {name!r}; expected one of: {known}")
     image = sample_image(name)
     rows, columns = image.pixels.shape[:2]
     return {
@@ -313,16 +336,28 @@ def _of_displacement(path: Path, limit: float) -> dict[str, Any]:
         "frames": len(record),
         "notes": [],
     }
-    try:
-        about["mesh"] = list(record.grid().shape)
-    except InputError:
-        about["notes"].append("the points are no regular grid")
+    if is_spatial_record(path):
+        spatial = read_spatial_displacement(path, limit=limit)
+        moved, depth = (
+            np.linalg.norm(v, axis=-1) for v in (spatial.displacement, spatial.tip - spatial.entry)
+        )
+        about |= of_space_record(spatial)
+        about["notes"].append(
+            "a run in space: points and largest displacement are those of the mesh in space; tracking and identification read the "
+            f"{len(record.points)} points of the picture"
+        )
+    else:
+        try:
+            about["mesh"] = list(record.grid().shape)
+        except InputError:
+            about["notes"].append("the points are no regular grid")
     if len(record):
         last = float(record.times[-1] - record.times[0])
         about["duration_s"] = round(last, 6)
         about["largest_displacement_mm"] = round(float(moved.max()), 6)
         about["deepest_insertion_mm"] = round(float(depth.max()), 6)
         about["speed_mm_s"] = [round(float(record.speed.min()), 6), round(float(record.speed.max()), 6)]
+    about["notes"] = about.pop("notes")
     return about
 
 
@@ -348,7 +383,7 @@ def _of_toml(path: Path) -> dict[str, Any]:
             "title": run.title,
             "image": run.image.file,
             "model": run.model.kind,
-            "mesh": list(run.mesh.nodes),
+            **(of_space_scenario(run) if scenario_room.is_spatial(run) else {"mesh": list(run.mesh.nodes)}),
         }
     return about
 
@@ -378,6 +413,14 @@ def _shown_box(value: list[int]) -> list[str]:
     return [f"columns {value[0]} to {value[2] - 1}, rows {value[1]} to {value[3] - 1}"]
 
 
+def _shown_moves(value: dict[str, Any]) -> str:
+    frames = f"{value['frames']} frames" if "frames" in value else ""
+    if "moves_mm" not in value:
+        return f"{frames}, none of them valid"
+    moved = f"moves {value['moves_mm']:g} mm, turns {value['turns_degrees']:g} degrees"
+    return f"{frames}, {moved}" if frames else moved
+
+
 def _shown_regions(value: list[dict[str, Any]]) -> list[str]:
     return [
         f"{r['content']}, {_shown_box(r['box'])[0]}"
@@ -393,6 +436,12 @@ _SHOWN: dict[str, Callable[[Any], list[str]]] = {
     "spacing_mm": lambda v: [f"{v[0]:.6g} lateral, {v[1]:.6g} depth"],
     "size_mm": lambda v: [f"{v[0]:.6g} wide, {v[1]:.6g} deep"],
     "speed_mm_s": lambda v: [f"{v[0]:.6g} to {v[1]:.6g}"],
+    "voxels": lambda v: [" x ".join(map(str, v[:3])) + (f", {v[3]}" if len(v) > 3 else "")],
+    "voxel_mm": lambda v: [f"{v[0]:.6g} lateral, {v[1]:.6g} along depth, {v[2]:.6g} across"],
+    "block_mm": lambda v: [f"{v[0]:.6g} wide, {v[1]:.6g} deep, {v[2]:.6g} thick"],
+    "transforms": lambda v: [f"{name}: {_shown_moves(part)}" for name, part in v.items()],
+    "probe": lambda v: [v if isinstance(v, str) else _shown_moves(v)],
+    "followed_share": lambda v: [f"{100 * v:.1f} % of the first picture's points at worst"],
     "region": _shown_box,
     "regions": _shown_regions,
     "arrays": lambda v: [f"{name} ({', '.join(map(str, shape))})" for name, shape in v.items()],

@@ -36,8 +36,8 @@ def study(
     """Regenerate the paper's study: Fig. 2, 3a, 3b, tables (CSV, JSON) and one self-contained report.html.
 
     Every model is compared with finite elements under the same needle, in accuracy (fitted and held-out insertions, four
-    moduli in both readings) and in time per step (every method named). Lesions, layers and other edges follow, and where linear and plane
-    elasticity stop being good. Cases that are in the folder already are not run again.
+    moduli in both readings) and in time per step (every method named). Lesions, layers and other edges follow, where linear elasticity stops
+    being good, and what a plane model misses of tissue in space. Cases that are in the folder already are not run again.
     """
     from rich.console import Console
     from rich.table import Table

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterable
+from dataclasses import asdict
+from math import isfinite
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -100,6 +102,13 @@ def track(
     preview: Annotated[
         Path | None, typer.Option(metavar="PNG", help="picture with arrows; beside FIELD where not given")
     ] = None,
+    truth: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="NPZ",
+            help="displacement.npz of the simulation that made the cine: says how far the track is off",
+        ),
+    ] = None,
     limit: Annotated[
         float, typer.Option(min=1, metavar="MIB", help="most memory for frames and track, MiB")
     ] = LIMIT,
@@ -126,6 +135,9 @@ def track(
         None if channels is None else positive(channels, "--channels"),
         None if sampling is None else positive(sampling, "--sampling"), start,
     )  # fmt: skip
+    known = (
+        None if truth is None else tracking.read_track(truth)
+    )  # read first: a mistake is said before the work
     frames = open_frames(
         cine,
         spacing=None if spacing is None else numbers(spacing, 2, "--spacing"),
@@ -184,6 +196,10 @@ def track(
         )
     tracking.write_track(out, found, poses)
     report = summary(found, perf_counter() - began)
+    if known is not None:
+        report["against_truth"] = {
+            k: round(v, 4) if isfinite(v) else None for k, v in asdict(tracking.score(found, known)).items()
+        }
     picture = preview or out.with_suffix(".png")
     draw(frames, found, poses, picture)
     if json_:
@@ -193,6 +209,23 @@ def track(
     Console().print(
         f"{report['points']} points in {report['frames']} frames in {report['seconds']:.1f} s, {report['keyframes']} keyframes; "
         f"largest trusted motion {report['largest_mm']:.3f} mm, {report['trusted']:.0%} trusted, {report['trusted_last_frame']:.0%} in the last frame; wrote {out} and {picture}"
+    )
+    if known is not None:
+        Console().print(_against_truth(report["against_truth"]))
+
+
+def _against_truth(score: dict[str, Any]) -> str:
+    """Return in one sentence how far a track is from the truth."""
+    if not score["points"]:
+        return "no trusted point has a truth: tissue left the picture, or the track is of another part of it"
+    gone = (
+        ""
+        if score["gone_trusted"] is None
+        else f"; of what left the slice or the picture {score['gone_trusted']:.0%} is trusted all the same"
+    )
+    return (
+        f"against the truth: {score['axial_um']:.1f} um axial, {score['lateral_um']:.1f} um lateral (root mean square; the motion {score['motion_um']:.0f} um), "
+        f"{score['outliers']:.1%} miss by 0.1 mm or more, {score['followed']:.0%} of what can be followed is trusted{gone}"
     )
 
 

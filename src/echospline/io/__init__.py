@@ -8,8 +8,11 @@ from echospline.io.displacement import (
     DisplacementRecord,
     DisplacementWriter,
     displacement_shapes,
+    is_spatial_record,
     read_displacement,
+    read_spatial_displacement,
 )
+from echospline.io.displacement_space import SpatialDisplacementRecord
 from echospline.io.echoes import EchoStream, EchoWriter, open_echoes, read_echoes
 from echospline.io.kind import PICTURES, head, kind_of
 from echospline.io.needle_path import read_needle
@@ -42,10 +45,12 @@ __all__ = [
     "EchoWriter",
     "LineCine",
     "Recording",
+    "SpatialDisplacementRecord",
     "choose_image",
     "decoding",
     "displacement_shapes",
     "head",
+    "is_spatial_record",
     "kind_of",
     "list_arrays",
     "needs_window",
@@ -59,5 +64,6 @@ __all__ = [
     "read_echoes",
     "read_image",
     "read_needle",
+    "read_spatial_displacement",
     "sample_image",
 ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -18,6 +18,8 @@ from numpy.typing import ArrayLike
 
 from echospline.atomic import give_name, part_of, second_part, writing
 from echospline.errors import InputError
+from echospline.io.displacement_space import RANKS as KEYS_IN_SPACE
+from echospline.io.displacement_space import SpatialDisplacementRecord
 from echospline.io.kind import head
 from echospline.io.recording import LIMIT, MIB, decoding
 from echospline.scene import Floats, NeedlePose, RegularGrid, as_points
@@ -246,8 +248,17 @@ def read_displacement(path: str | Path, *, limit: float = LIMIT) -> Displacement
     ------
     InputError
         If the file is no such record, damaged or too large.
+
+    Returns
+    -------
+    DisplacementRecord
+        Of a run in space: the motion that its picture shows, and the needle projected onto its plane, in the cine's coordinates.
     """
     path = Path(path)
+    if is_spatial_record(path):
+        flat = read_spatial_displacement(path, limit=limit).in_plane()
+        points, displacement, times, tip, entry, speed = (flat[name] for name in KEYS)
+        return DisplacementRecord(points, displacement, times, tip, entry, speed)
     shapes = displacement_shapes(path)
     size = sum(prod(shape) * 8 for shape in shapes.values()) / MIB
     if size > limit:
@@ -258,6 +269,38 @@ def read_displacement(path: str | Path, *, limit: float = LIMIT) -> Displacement
         arrays = {name: _array(archive, path, name) for name in shapes}
     loads = {name: arrays.pop(name) for name in LOADS if name in arrays}
     return DisplacementRecord(**arrays, loads=loads)
+
+
+def is_spatial_record(path: str | Path) -> bool:
+    """Return whether a file is the displacement record of a run in space: it holds the pose of a plane."""
+    path = Path(path)
+    if not head(path).startswith(b"PK"):
+        return False
+    with decoding(path, "displacement.npz"), zipfile.ZipFile(path) as archive:
+        return {"kind.npy", "plane.npy", "picture_points.npy"} <= set(archive.namelist())
+
+
+def read_spatial_displacement(path: str | Path, *, limit: float = LIMIT) -> SpatialDisplacementRecord:
+    """Read the displacement record of a run in space; nothing is unpickled, nothing is allocated before its size is known.
+
+    Raises
+    ------
+    InputError
+        If the file is no such record, damaged or too large.
+    """
+    path = Path(path)
+    if not is_spatial_record(path):
+        raise InputError(f"{path} is no displacement.npz of a run in space")
+    with decoding(path, "displacement.npz"), zipfile.ZipFile(path) as archive:
+        shapes = {name: _declared(archive, path, name, KEYS_IN_SPACE)[0] for name in KEYS_IN_SPACE}
+        size = sum(prod(shape) * 8 for shape in shapes.values()) / MIB
+        if size > limit:
+            raise InputError(
+                f"{path} declares arrays of {size:,.0f} MiB, more than the limit of {limit:,.0f} MiB: raise it"
+            )
+        arrays = {name: _array(archive, path, name) for name in shapes}
+    valid = arrays.pop("picture_valid") > 0
+    return SpatialDisplacementRecord(**arrays, picture_valid=valid)
 
 
 def displacement_shapes(path: str | Path) -> dict[str, tuple[int, ...]]:
@@ -279,15 +322,17 @@ def displacement_shapes(path: str | Path) -> dict[str, tuple[int, ...]]:
 
 
 def _declared(
-    archive: zipfile.ZipFile, path: Path, name: str
+    archive: zipfile.ZipFile, path: Path, name: str, expected: Iterable[str] = KEYS
 ) -> tuple[tuple[int, ...], np.dtype[np.generic], bool]:
     """Return the shape, type and order in a member's header; refused unless they account for the member's size."""
     if f"{name}.npy" not in archive.namelist():
-        raise InputError(f"{path} lacks the array {name!r}; expected {', '.join(KEYS)}")
+        raise InputError(f"{path} lacks the array {name!r}; expected {', '.join(expected)}")
     with archive.open(f"{name}.npy") as member:
         shape, fortran, dtype, start = _npy_header(member)
-    if dtype.kind != "f" or dtype.itemsize not in (4, 8):
-        raise InputError(f"{path}: {name} must hold 32 or 64-bit floating point numbers; got {dtype}")
+    flags = name == "picture_valid"
+    if (dtype.kind != "b") if flags else (dtype.kind != "f" or dtype.itemsize not in (4, 8)):
+        kind = "true or false" if flags else "32 or 64-bit floating point numbers"
+        raise InputError(f"{path}: {name} must hold {kind}; got {dtype}")
     held = archive.getinfo(f"{name}.npy").file_size - start
     if prod(shape) * dtype.itemsize != held:
         raise InputError(

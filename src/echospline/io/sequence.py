@@ -25,6 +25,7 @@ from echospline.scene import (
     Pixels,
     Reach,
     RegularGrid,
+    SpatialPose,
     UltrasoundImage,
     frames_of,
     transform_between,
@@ -232,7 +233,7 @@ class SequenceWriter:
     grid : RegularGrid
         Pixels in mm.
     plane : ImagingPlane, optional
-        Plane of the picture; Slicer's axial plane when not given.
+        Plane of the picture; Slicer's axial plane when not given. In space every frame has its own (`add`).
 
     Raises
     ------
@@ -246,6 +247,7 @@ class SequenceWriter:
         if not self.path.name.lower().endswith((".mha", ".nrrd")):
             raise InputError(f"a sequence is written to NAME.igs.mha or NAME.seq.nrrd; got {self.path.name}")
         self._times: list[float] = []
+        self._images: list[Floats] = []
         self._tips: list[Floats] = []
         self._entries: list[Floats] = []
         self._form: tuple[tuple[int, ...], np.dtype[np.generic]] | None = None
@@ -253,8 +255,21 @@ class SequenceWriter:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._spool = part_of(self.path).open("x+b")
 
-    def add(self, pixels: Pixels, time: float, pose: NeedlePose) -> None:
+    def add(
+        self, pixels: Pixels, time: float, pose: NeedlePose | SpatialPose, plane: ImagingPlane | None = None
+    ) -> None:
         """Append one frame.
+
+        Parameters
+        ----------
+        pixels : ndarray
+            The picture.
+        time : float
+            s.
+        pose : NeedlePose or SpatialPose
+            The needle in the plane, or in space: then in the frame that planes lead to, Reference.
+        plane : ImagingPlane, optional
+            Plane of this picture; the writer's when not given.
 
         Raises
         ------
@@ -275,9 +290,12 @@ class SequenceWriter:
                 f"a frame must be later than the one before at {self._times[-1]} s; got {time} s"
             )
         self._times.append(float(time))
-        tip = self.plane.tip_matrix(pose)
+        plane = plane or self.plane
+        spatial = isinstance(pose, SpatialPose)
+        tip = pose.tip_matrix() if isinstance(pose, SpatialPose) else plane.tip_matrix(pose)
         entry = tip.copy()
-        entry[:3, 3] = self.plane.lift(np.array([pose.entry]))[0]
+        entry[:3, 3] = pose.entry if spatial else plane.lift(np.array([pose.entry]))[0]
+        self._images.append(plane.image_matrix(self.grid))
         self._tips.append(tip)
         self._entries.append(entry)
         with writing(self.path):
@@ -295,13 +313,12 @@ class SequenceWriter:
             self.abandon()
             raise InputError(f"{self.path} would have no frame")
         count = len(self._times)
-        image = self.plane.image_matrix(self.grid)
         header = Header(
             shape=(count, *self._form[0]),
             dtype=self._form[1],
             times=np.array(self._times),
             transforms={
-                f"{IMAGE}To{REFERENCE}": np.tile(image, (count, 1, 1)),
+                f"{IMAGE}To{REFERENCE}": np.array(self._images),
                 f"{NEEDLE}To{REFERENCE}": np.array(self._tips),
                 f"{ENTRY}To{REFERENCE}": np.array(self._entries),
             },
@@ -310,7 +327,7 @@ class SequenceWriter:
         )
         try:
             with appearing(self.path) as part, part.open("xb") as file:
-                file.write(write_header(header, self.path, image))
+                file.write(write_header(header, self.path, self._images[0]))
                 self._spool.seek(0)
                 while block := self._spool.read(1 << 20):
                     file.write(block)

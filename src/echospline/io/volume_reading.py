@@ -78,7 +78,7 @@ def _of_dicom(path: Path, limit: float) -> Volume:
     _check(path, recording)
     voxels = np.stack(list(slices(recording, order)))
     _check_finite(path, voxels)
-    return _along_frame(Volume(voxels, spacing, source=path.name), direction)
+    return along_frame(Volume(voxels, spacing, source=path.name), direction)
 
 
 def _check(path: Path, recording: Recording) -> None:

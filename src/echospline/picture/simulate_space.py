@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from math import ceil, isfinite
 from time import perf_counter
 from typing import Literal
 
+import numpy as np
+
 from echospline.errors import FoldingError, InputError
 from echospline.mechanics.protocol import SpatialTissueModel, State
 from echospline.picture.needle_echo import NeedleEcho
-from echospline.picture.slices import SliceDrawing, SliceFormer, SpatialFolds
+from echospline.picture.slices import SliceDrawing, SliceFormer, SpatialFolds, lattice_of
 from echospline.scene import (
     Floats,
     ImagingPlane,
     PlanePath,
     Probe,
+    SeenMotion,
     SpatialInsertion,
     SpatialPose,
     UltrasoundImage,
     Volume,
+    seen_motion,
 )
 
 
@@ -52,6 +56,8 @@ class SpatialFrame:
         Share of the picture that lies outside the volume.
     milliseconds : dict
         Time per stage: interaction, inverse, slice, needle.
+    motion : callable
+        Displacement (n, 3) in mm of any reference points (n, 3) in mm.
     """
 
     index: int
@@ -65,6 +71,14 @@ class SpatialFrame:
     folds: SpatialFolds | None
     outside: float
     milliseconds: dict[str, float] = field(default_factory=dict)
+    motion: Callable[[Floats], Floats] = field(default=np.zeros_like, repr=False)
+
+    def seen_from(self, first: SpatialFrame, probe: Probe, volume: Volume) -> SeenMotion:
+        """Return where the picture shows the tissue of a first picture now, on the first one's lattice (row by row)."""
+        start = first.places.reshape(-1, 3)
+        at = lattice_of(probe).nodes
+        known = volume.contains(start) & probe.sees(at)
+        return seen_motion(at, start + self.motion(start), self.plane, probe, known)
 
 
 def simulate_space(
@@ -152,4 +166,5 @@ def simulate_space(
             drawn.folds,
             drawn.outside,
             {"interaction": interaction, **drawn.milliseconds},
+            displaced,
         )

@@ -40,6 +40,7 @@ Field = Callable[[Floats], Floats]
 SliceFormer = Callable[[ImagingPlane, Probe, Field | None, int], UltrasoundImage]
 """Forms the picture of a plane on a probe's grid from the tissue's displacement (none: at rest); the number is the frame's, for its noise."""
 
+
 @runtime_checkable
 class CoreField(Protocol):
     """A displacement that the core can sum itself: planes are then traced back there."""

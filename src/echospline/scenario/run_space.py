@@ -19,6 +19,7 @@ from echospline.atomic import appearing, writing
 from echospline.errors import InputError
 from echospline.io import open_writer
 from echospline.io.displacement_space import SpatialDisplacementWriter
+from echospline.io.sequence import SequenceWriter
 from echospline.mechanics import describe_core
 from echospline.mechanics.protocol import SpatialTissueModel, State, described
 from echospline.picture.simulate_space import SpatialFrame, simulate_space
@@ -26,9 +27,8 @@ from echospline.picture.slices import SliceFormer, lattice_of
 from echospline.scenario.run import SUFFIX, package_versions
 from echospline.scenario.scenario import Scenario
 from echospline.scenario.space_scene import moduli
-from echospline.scene import Volume
+from echospline.scene import RegularGrid, Volume
 
-SLICER = ("igs.mha", "seq.nrrd")
 FAR_OUT = 0.5
 """Share of the picture outside the volume from which a run says so."""
 
@@ -85,6 +85,17 @@ class _Tally:
         ]
 
 
+def _sink(
+    stack: ExitStack, name: str, out: Path, grid: RegularGrid, fps: float
+) -> Callable[[SpatialFrame], None]:
+    """Open the writer of one format; those of PLUS and 3D Slicer hold the plane and the needle of every frame, in the scene's frame."""
+    if name in ("igs.mha", "seq.nrrd"):
+        recording = stack.enter_context(SequenceWriter(out / SUFFIX[name], grid))
+        return lambda frame: recording.add(frame.image.pixels, frame.time, frame.pose, frame.plane)
+    cine = stack.enter_context(open_writer(out / SUFFIX[name], grid, fps))
+    return lambda frame: cine.add(frame.image.pixels, frame.time)
+
+
 def run_space(
     scenario: Scenario,
     volume: Volume,
@@ -128,16 +139,12 @@ def run_space(
     Raises
     ------
     InputError
-        If the scenario has no [space], a format cannot be written in space, or the folder cannot be written.
+        If the scenario has no [space], or the folder cannot be written.
     """
     space = scenario.space
     if space is None:
         raise InputError("this scenario is no scene in space: it has no [space] table")
     output = scenario.output
-    if foreign := [name for name in output.formats if name in SLICER]:
-        raise InputError(
-            f"output.formats = {foreign[0]} is not written in space yet; choose mp4, gif, png or mha"
-        )
     began = perf_counter()
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
@@ -149,21 +156,21 @@ def run_space(
     record = SpatialDisplacementWriter(
         out / "displacement.npz", model.grid.nodes, lattice.nodes.reshape(*lattice.shape[::-1], 2)
     )
+    first: SpatialFrame | None = None
     with ExitStack() as stack:
         stack.enter_context(threadpool_limits(limits=1, user_api="blas"))
-        sinks = [
-            stack.enter_context(open_writer(out / SUFFIX[name], probe.grid, output.fps))
-            for name in dict.fromkeys(output.formats)
-        ]
+        sinks = [_sink(stack, name, out, probe.grid, output.fps) for name in dict.fromkeys(output.formats)]
         for frame in simulate_space(
             volume, probe, planes, insertion, model, fps=output.fps, longest_step=output.longest_step,
             folding=output.folding, needle=scenario.needle_echo(), form_image=form_image,
         ):  # fmt: skip
             since = perf_counter()
             for sink in sinks:
-                sink.add(frame.image.pixels, frame.time)
+                sink(frame)
+            first = first or frame
             if output.displacement:
-                record.add(frame.displacement, frame.time, frame.pose, frame.plane, frame.places)
+                seen = frame.seen_from(first, probe, volume)
+                record.add(frame.displacement, frame.time, frame.pose, frame.plane, frame.places, seen)
             frame.milliseconds["write"] = 1e3 * (perf_counter() - since)
             tally.add(frame)
             if watch is not None:

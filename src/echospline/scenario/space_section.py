@@ -168,8 +168,7 @@ class SpaceSection(Section):
 
     def grid(self, volume: Volume) -> SpatialGrid:
         """Lay the mesh over the volume, corner to corner."""
-        low = np.array(volume.origin)
-        return SpatialGrid.spanning(tuple(low), tuple(low + np.array(volume.size)), self.mesh.nodes)
+        return volume.mesh(self.mesh.nodes)
 
 
 def view_of(insertion: SpatialInsertion, view: Literal["longitudinal", "transverse"]) -> ImagingPlane:

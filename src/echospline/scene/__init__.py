@@ -13,6 +13,7 @@ if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.scene.needle import ZERO_LENGTH, Insertion, NeedlePose
     from echospline.scene.number import is_number
     from echospline.scene.probe import Probe
+    from echospline.scene.seen_motion import SeenMotion, seen_motion
     from echospline.scene.space import PlanePath, SpatialGrid, SpatialInsertion, SpatialPose, probe_plane
     from echospline.scene.tissue import (
         Box,
@@ -70,6 +71,7 @@ __all__ = [
     "Reach",
     "Region",
     "RegularGrid",
+    "SeenMotion",
     "Shape",
     "SpatialGrid",
     "SpatialInsertion",
@@ -97,6 +99,7 @@ __all__ = [
     "probe_angles",
     "probe_plane",
     "rigid_fault",
+    "seen_motion",
     "shades",
     "tip_frame",
     "transform_between",

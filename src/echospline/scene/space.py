@@ -160,6 +160,16 @@ class SpatialPose:
             return (0.0, 0.0, 0.0)
         return as_triple(np.subtract(self.tip, self.entry) / length, "axis")
 
+    def tip_matrix(self) -> Floats:
+        """Return the matrix from a frame at the tip to the scene: +Z inserts, +Y is as near to the scene's z as can be."""
+        z = np.array(self.axis if self.depth >= ZERO_LENGTH else (0.0, 1.0, 0.0))
+        up = np.array([0.0, 0.0, 1.0]) if abs(z[2]) < 0.999 else np.array([1.0, 0.0, 0.0])
+        y = up - (up @ z) * z
+        y /= np.linalg.norm(y)
+        matrix = np.eye(4)
+        matrix[:3, 0], matrix[:3, 1], matrix[:3, 2], matrix[:3, 3] = np.cross(y, z), y, z, self.tip
+        return matrix
+
     def seen_from(self, plane: ImagingPlane) -> tuple[Triple, Triple]:
         """Return entry and tip in the frame of an imaging plane: (lateral, depth, distance from the plane), mm."""
         ends = plane.lower(np.array([self.entry, self.tip]))

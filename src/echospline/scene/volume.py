@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from echospline.errors import InputError
 from echospline.scene.grid import Floats, as_points
+from echospline.scene.space import SpatialGrid
 
 Voxels = NDArray[np.generic]
 
@@ -76,6 +77,11 @@ class Volume:
         """Extent from the first to the last voxel centre along x, y and z, mm."""
         x, y, z = ((n - 1) * h for n, h in zip(self.shape, self.spacing, strict=True))
         return x, y, z
+
+    def mesh(self, nodes: tuple[int, int, int]) -> SpatialGrid:
+        """Return a mesh for a tissue model: so many nodes along x, y and z, the first at the first voxel and the last at the last."""
+        low = np.array(self.origin)
+        return SpatialGrid.spanning(tuple(low), tuple(low + np.array(self.size)), nodes)
 
     def contains(self, points: ArrayLike) -> NDArray[np.bool_]:
         """Test which points (n, 3) in mm lie between the outermost voxel centres."""

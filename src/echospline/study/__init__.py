@@ -8,7 +8,13 @@ if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.study.bench import benchmark
     from echospline.study.calibrate import IN_PLANE, PRINTED, calibrate
     from echospline.study.charts_exvivo import error_per_depth, motion_maps
-    from echospline.study.dataset import create_store, make_sample, write_summary
+    from echospline.study.dataset import (
+        create_store,
+        make_sample,
+        sample_arrays,
+        sample_bytes,
+        write_summary,
+    )
     from echospline.study.exvivo import Fit, Regions, compared, fit, regions, tracker_error
     from echospline.study.identify import Identification, identify
     from echospline.study.paper import FULL, QUICK, study
@@ -43,6 +49,8 @@ __all__ = [
     "motion_maps",
     "paragraph",
     "regions",
+    "sample_arrays",
+    "sample_bytes",
     "study",
     "sweep",
     "table",

@@ -15,10 +15,12 @@ from echospline.atomic import appearing, claimed
 from echospline.errors import InputError
 from echospline.io import read_needle
 from echospline.mechanics import FEMModel, GreenModel, TPSModel
-from echospline.scenario import MODELS, Scenario, build_model, load
+from echospline.scenario import MODELS, Scenario, build_model, is_spatial, load, open_spatial
+from echospline.scenario.space_section import SpaceSection
 from echospline.scene import Floats, field_error
 from echospline.study.charts import error_map
 from echospline.study.identify import Identification, Objective, grid_search, identify
+from echospline.study.spatial_fit import PictureRuns, SeenRun, fit_in_space
 from echospline.study.unit_fields import ForceFields, Observation, SplineFields
 from echospline.tracking import read_track
 
@@ -31,7 +33,7 @@ PRINTED: Mapping[str, Any] = {
 }
 """The laws under which fields are linear in the parameters."""
 
-IN_PLANE = 'parameters are identified in the plane: give a scenario with model.mechanics = "plane"'
+IN_PLANE = 'parameters are identified in the plane or in a scene with [space]: give a scenario with model.mechanics = "plane"'
 """What is said to scenarios whose picture is the middle of a slab in space."""
 
 
@@ -65,7 +67,7 @@ def calibrate(
     objective : {"mae", "rmse"}
         The error to minimise.
     method : {"closed", "grid"}
-        Closed form and a small search, or the paper's brute force.
+        Closed form and a small search, or the paper's brute force; a scene in space is always searched by simulated runs (`spatial_fit`).
     needle : str, optional
         Path of the needle (CSV, or the npz of another record) where the record has none.
     confidence : float
@@ -132,6 +134,14 @@ def _calibrated(
     kind = model or scene.model.kind
     if kind not in MODELS:
         raise InputError(f"a model is one of {', '.join(MODELS)}; got {kind!r}")
+    if is_spatial(scene):
+        if method != "closed" or needle is not None:
+            raise InputError(
+                "a scene in space is identified by simulated runs with the needle and probe of its scenario: leave out --method and --needle"
+            )
+        return _calibrated_in_space(
+            path, folder, source, scene, kind, objective, confidence, frames, bootstrap, seed
+        )
     if scene.model.mechanics == "space":
         raise InputError(IN_PLANE)
     if method not in ("closed", "grid"):
@@ -161,7 +171,41 @@ def _calibrated(
     return report
 
 
-def _observation(path: Path, needle: str | None, confidence: float) -> Observation:
+def _calibrated_in_space(
+    path: Path,
+    folder: Path,
+    source: Path,
+    scene: Scenario,
+    kind: str,
+    objective: Objective,
+    confidence: float,
+    frames: int,
+    bootstrap: int,
+    seed: int,
+) -> dict[str, Any]:
+    """Identify a spatial model from the motion that a picture showed."""
+    opened = open_spatial(scene.with_values({"model.kind": kind}), source.parent)
+    space = opened.scenario.space or SpaceSection()
+    seen = _observation(path, None, confidence, needed=False)
+    chosen = _chosen(seen, frames)
+    corner = np.array(space.probe.probe().grid.origin)  # a cine's first pixel is (0, 0)
+    run = SeenRun(seen.points + corner, seen.times - seen.times[0], chosen, seen.displacement[chosen])
+    runs = PictureRuns(opened.scenario, space.grid(opened.volume), opened.tissue, run)
+    with threadpool_limits(limits=1):
+        found = fit_in_space(runs, objective, bootstrap=bootstrap, seed=seed)
+    result = runs.with_values(found.values).model_copy(update={"title": "identified parameters"})
+    result.save(folder / "identified.toml", source.parent)
+    error_map(seen.points, found.error_map, folder / "error_map", f"{kind} in space identified: {path.name}")
+    report = _report(
+        kind, objective, path, seen.frames(chosen), found, seen.displacement[chosen] - runs.still()
+    )
+    report["in_space"] = True
+    with appearing(folder / "identification.json") as part:
+        part.write_text(json.dumps(report, indent=1, allow_nan=False), encoding="utf-8")
+    return report
+
+
+def _observation(path: Path, needle: str | None, confidence: float, *, needed: bool = True) -> Observation:
     """Read a record; points that were not tracked well enough become nan."""
     if not 0.0 <= confidence <= 1.0:
         raise InputError(f"confidence must lie in 0 to 1; got {confidence}")
@@ -171,7 +215,7 @@ def _observation(path: Path, needle: str | None, confidence: float) -> Observati
     poses = [
         record.pose(i) if insertion is None else insertion.pose(float(t)) for i, t in enumerate(record.times)
     ]
-    if all(pose.depth == 0 for pose in poses):
+    if needed and all(pose.depth == 0 for pose in poses):
         raise InputError(f"{path} holds no needle; say where it was with --needle FILE.csv")
     seen = np.where(track.confidence[..., None] >= confidence, record.displacement, np.nan)
     return Observation(record.points, seen, record.times, poses)
@@ -239,10 +283,16 @@ def _axes(kind: str, seen: Observation, runs: int) -> dict[str, Sequence[float]]
 
 
 def _report(
-    kind: str, objective: str, path: Path, seen: Observation, found: Identification
+    kind: str,
+    objective: str,
+    path: Path,
+    seen: Observation,
+    found: Identification,
+    observed: Floats | None = None,
 ) -> dict[str, Any]:
     per_frame = []
-    for t, u, v in zip(seen.times, found.field, seen.displacement, strict=True):
+    observed = seen.displacement if observed is None else observed
+    for t, u, v in zip(seen.times, found.field, observed, strict=True):
         moves = (np.hypot(*np.nan_to_num(v).T) > 0).any()
         per_frame.append({"time_s": float(t), "mae_mm": field_error(u, v).mae if moves else None})
     return {

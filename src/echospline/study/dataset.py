@@ -1,4 +1,4 @@
-"""Datasets for learning: drawn scenarios, imaged phantoms, true motion, needle masks; one chunk per sample."""
+"""Datasets for learning: drawn scenarios, imaged phantoms or volumes, true motion, needle masks; one chunk per sample."""
 
 from __future__ import annotations
 
@@ -16,8 +16,16 @@ from echospline.atomic import appearing, writing
 from echospline.errors import InputError, MissingExtraError
 from echospline.laboratory import phantom_pictures
 from echospline.picture import OUTER_DIAMETER, simulate
-from echospline.scenario import PHANTOM, Scenario, build_model, load
+from echospline.scenario import PHANTOM, Scenario, build_model, is_spatial, load
+from echospline.scenario.space_section import SpaceSection
 from echospline.scene import RegularGrid, UltrasoundImage
+from echospline.study.dataset_space import (
+    SpatialVariation,
+    drawn_space,
+    imaged_space,
+    near_segment,
+    spatial_arrays,
+)
 
 LAYOUT = 1
 
@@ -116,6 +124,30 @@ def drawn(base: Scenario, index: int, seed: int, frames: int, variation: Variati
     return base.with_values(values, f"sample {index}")
 
 
+def sample_arrays(base: Scenario, frames: int) -> dict[str, tuple[tuple[int, ...], str]]:
+    """Return shape of a sample and type of every array of a dataset, in the plane or in space as the base is."""
+    if is_spatial(base):
+        return spatial_arrays(base, frames)
+    nx, ny = base.phantom.grid().shape
+    mx, my = base.mesh.nodes
+    return {
+        "image": ((frames, ny, nx), "uint8"),
+        "needle_mask": ((frames, ny, nx), "bool"),
+        "displacement": ((frames, my, mx, 2), "float32"),
+        "tip": ((frames, 2), "float64"),
+        "entry": ((frames, 2), "float64"),
+        "speed": ((frames,), "float64"),
+        "times": ((frames,), "float64"),
+    }
+
+
+def sample_bytes(base: Scenario, frames: int) -> int:
+    """Return the size of a sample before it is compressed, bytes."""
+    return sum(
+        int(np.prod(shape)) * np.dtype(kind).itemsize for shape, kind in sample_arrays(base, frames).values()
+    )
+
+
 def create_store(path: Path, base: Scenario, n: int, frames: int, seed: int, sources: Sequence[str]) -> None:
     """Create the arrays, or check that existing ones have the same layout; more samples enlarge them.
 
@@ -127,21 +159,21 @@ def create_store(path: Path, base: Scenario, n: int, frames: int, seed: int, sou
         If zarr is not installed.
     """
     zarr = _zarr()
-    nx, ny = base.phantom.grid().shape
-    mx, my = base.mesh.nodes
+    arrays, units = (
+        sample_arrays(base, frames),
+        "mm, s, mm/s; points (lateral, depth); displacement deformed minus rest",
+    )
+    pixel, variation = list(base.phantom.pixel), asdict(Variation())
+    if is_spatial(base):
+        side = (base.space or SpaceSection()).probe.pixel
+        pixel, variation = [side, side], asdict(SpatialVariation())
+        units = (
+            "mm, s, mm/s; displacement (lateral, depth) and out_of_plane of the first picture's tissue on every eighth pixel, against the first frame; "
+            "tip and entry (x, y, z) in the scene; plane: picture's frame, its origin the middle of the probe's face, to scene"
+        )
     meaning = {
-        "layout": LAYOUT, "seed": seed, "frames": frames, "bases": list(sources), "pixel_mm": list(base.phantom.pixel),
-        "variation": asdict(Variation()), "units": "mm, s, mm/s; points (lateral, depth); displacement deformed minus rest",
+        "layout": LAYOUT, "seed": seed, "frames": frames, "bases": list(sources), "pixel_mm": pixel, "variation": variation, "units": units,
     }  # fmt: skip
-    arrays = {
-        "image": ((frames, ny, nx), "uint8"),
-        "needle_mask": ((frames, ny, nx), "bool"),
-        "displacement": ((frames, my, mx, 2), "float32"),
-        "tip": ((frames, 2), "float64"),
-        "entry": ((frames, 2), "float64"),
-        "speed": ((frames,), "float64"),
-        "times": ((frames,), "float64"),
-    }
     if (path / "zarr.json").exists():
         group = zarr.open_group(str(path), mode="r+")
         known = json.loads(json.dumps(meaning))
@@ -171,8 +203,13 @@ def make_sample(*, store: str, bases: Sequence[str], index: int, seed: int, fram
     began = perf_counter()
     path = Path(store)
     source = Path(bases[index % len(bases)])
-    scenario = drawn(load(source), index, seed, frames)
-    sample = imaged(scenario, source.parent)
+    base = load(source)
+    if is_spatial(base):
+        scenario = drawn_space(base, index, seed, frames)
+        sample = imaged_space(scenario, source.parent)
+    else:
+        scenario = drawn(base, index, seed, frames)
+        sample = imaged(scenario, source.parent)
     if len(sample["times"]) != frames:
         raise InputError(f"sample {index} has {len(sample['times'])} frames; expected {frames}")
     group = _zarr().open_group(str(path), mode="r+")
@@ -222,13 +259,9 @@ def needle_mask(
     grid: RegularGrid, entry: tuple[float, float], tip: tuple[float, float], radius: float
 ) -> np.ndarray[Any, np.dtype[np.bool_]]:
     """Return the pixels that the needle covers, shape (rows, columns): nearer than ``radius`` mm to the shaft."""
-    shaft = np.subtract(tip, entry)
-    length2 = float(shaft @ shaft)
-    if length2 == 0.0:
+    if tuple(tip) == tuple(entry):  # not in the tissue yet
         return np.zeros(grid.shape[::-1], dtype=np.bool_)
-    x, y = grid.x[None, :] - entry[0], grid.y[:, None] - entry[1]
-    t = np.clip((x * shaft[0] + y * shaft[1]) / length2, 0.0, 1.0)
-    return np.asarray((x - t * shaft[0]) ** 2 + (y - t * shaft[1]) ** 2 <= radius**2)
+    return near_segment(grid, np.array(entry), np.array(tip), radius)
 
 
 def write_summary(path: Path, summary: Mapping[str, Any]) -> None:

@@ -48,9 +48,9 @@ class Identification:
     field : ndarray, shape (frames, n, 2)
         The fitted field, mm.
     method : str
-        "closed" or "grid".
+        "closed", "grid" or, in space, "simulated".
     runs : int
-        Fields evaluated (closed) or simulations run (grid).
+        Fields evaluated (closed) or simulations run (the others).
     seconds : float
         Time taken, bootstrap not included.
     """
@@ -133,7 +133,7 @@ def identify(
         intervals,
         condition,
         confounded,
-        _mean_over_frames(distance(fitted, observed)),
+        mean_over_frames(distance(fitted, observed)),
         fitted,
         "closed",
         problem.runs,
@@ -179,7 +179,7 @@ def grid_search(
         {},
         float("nan"),
         (),
-        _mean_over_frames(distance(simulated, observed)),
+        mean_over_frames(distance(simulated, observed)),
         simulated,
         "grid",
         runs,
@@ -283,7 +283,7 @@ class _Problem:
         rows, low = bounds or (self.rows, self.low)
         w = np.ones(len(b)) if weight is None else weight
         floor = 1e-6 * self.scale
-        x = _least(A, b, w, objective, floor, tolerance)
+        x = least_distances(A, b, w, objective, floor, tolerance)
         if (rows @ x >= low).all():
             return x
         back = np.linalg.inv(rows)
@@ -294,7 +294,7 @@ class _Problem:
             y = low.copy()
             if not held.all():
                 rest = b - B[..., held] @ y[held]
-                y[~held] = _least(B[..., ~held], rest, w, objective, floor, tolerance)
+                y[~held] = least_distances(B[..., ~held], rest, w, objective, floor, tolerance)
             if held.any() and (y >= low).all():
                 epsilon = np.hypot(*(B @ y - b).T)
                 found.append((float(w @ (epsilon if objective == "mae" else epsilon**2)), y))
@@ -304,32 +304,7 @@ class _Problem:
     def confounded(self, A: Floats, values: Mapping[str, float]) -> tuple[float, tuple[str, ...]]:
         """Return the condition of the Jacobian with unit columns, and one sentence per small singular vector."""
         names = list(self.fields.linear)
-        J = A[self.seen].reshape(-1, len(names))
-        norm = np.sqrt((J**2).sum(axis=0))
-        sentences = [
-            f"{n} leaves no trace in these frames" for n, s in zip(names, norm, strict=True) if s == 0
-        ]
-        live = norm > 0
-        if not live.any():
-            return np.inf, tuple(sentences)
-        gram = (J[:, live] / norm[live]).T @ (J[:, live] / norm[live])
-        eigenvalues, vectors = np.linalg.eigh(gram)
-        singular = np.sqrt(np.maximum(eigenvalues, 0))
-        condition = float(singular[-1] / singular[0]) if singular[0] > 0 else np.inf
-        alive = [n for n, keep in zip(names, live, strict=True) if keep]
-        for s, v in zip(singular, vectors.T, strict=True):
-            if s * CONFOUNDED < singular[-1]:
-                direction = v / norm[live]
-                lead = int(np.argmax(np.abs(v)))
-                part = [i for i in range(len(v)) if abs(v[i]) > 0.2]
-                others = ", ".join(
-                    f"{direction[i] / direction[lead]:+.3g} of {alive[i]}" for i in part if i != lead
-                )
-                sentences.append(
-                    f"{' and '.join(alive[i] for i in part)} cannot be told apart: +1 of {alive[lead]} with {others} "
-                    "changes almost nothing"
-                )
-        return (condition if live.all() else np.inf), tuple(sentences)
+        return confounding(names, A[self.seen].reshape(-1, len(names)))
 
     def bootstrap(
         self, A: Floats, objective: Objective, resamples: int, seed: int
@@ -351,8 +326,51 @@ class _Problem:
         return {n: (float(a), float(b)) for n, a, b in zip(self.fields.linear, low, high, strict=True)}
 
 
-def _least(A: Floats, b: Floats, w: Floats, objective: Objective, floor: float, tolerance: float) -> Floats:
-    """Solve weighted least squares, or least distances by reweighting (Weiszfeld), which converges because it is convex."""
+def confounding(names: Sequence[str], J: Floats) -> tuple[float, tuple[str, ...]]:
+    """Return the condition of a Jacobian (m, p) with unit columns, and one sentence per small singular vector."""
+    norm = np.sqrt((J**2).sum(axis=0))
+    sentences = [f"{n} leaves no trace in these frames" for n, s in zip(names, norm, strict=True) if s == 0]
+    live = norm > 0
+    if not live.any():
+        return np.inf, tuple(sentences)
+    gram = (J[:, live] / norm[live]).T @ (J[:, live] / norm[live])
+    eigenvalues, vectors = np.linalg.eigh(gram)
+    singular = np.sqrt(np.maximum(eigenvalues, 0))
+    condition = float(singular[-1] / singular[0]) if singular[0] > 0 else np.inf
+    alive = [n for n, keep in zip(names, live, strict=True) if keep]
+    for s, v in zip(singular, vectors.T, strict=True):
+        if s * CONFOUNDED < singular[-1]:
+            direction = v / norm[live]
+            lead = int(np.argmax(np.abs(v)))
+            part = [i for i in range(len(v)) if abs(v[i]) > 0.2]
+            others = ", ".join(
+                f"{direction[i] / direction[lead]:+.3g} of {alive[i]}" for i in part if i != lead
+            )
+            sentences.append(
+                f"{' and '.join(alive[i] for i in part)} cannot be told apart: +1 of {alive[lead]} with {others} "
+                "changes almost nothing"
+            )
+    return (condition if live.all() else np.inf), tuple(sentences)
+
+
+def least_distances(
+    A: Floats, b: Floats, w: Floats, objective: Objective, floor: float, tolerance: float
+) -> Floats:
+    """Solve A x = b in weighted least squares (rmse), or least distances (mae) by reweighting (Weiszfeld), which converges because it is convex.
+
+    Parameters
+    ----------
+    A, b : ndarray, shape (m, 2, p) and (m, 2)
+        Fields per unit, and the field to meet.
+    w : ndarray, shape (m,)
+        Weights.
+    objective : {"mae", "rmse"}
+        What is made least.
+    floor : float
+        Distance below which a point counts as met, in the unit of b.
+    tolerance : float
+        Relative fall of the sum below which reweighting ends.
+    """
     p = A.shape[-1]
     flat, target = A.reshape(-1, p), b.reshape(-1)
 
@@ -376,7 +394,8 @@ def _least(A: Floats, b: Floats, w: Floats, objective: Objective, floor: float, 
     return x
 
 
-def _mean_over_frames(epsilon: Floats) -> Floats:
+def mean_over_frames(epsilon: Floats) -> Floats:
+    """Return the mean of distances (frames, n) over the frames in which each point was followed, (n,); nan where it never was."""
     tracked = np.isfinite(epsilon)
     count = tracked.sum(axis=0)
     total = np.where(tracked, epsilon, 0.0).sum(axis=0)

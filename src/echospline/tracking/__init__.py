@@ -9,6 +9,7 @@ if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.tracking.carrier_phase import CarrierPhase
     from echospline.tracking.dense_flow import DenseFlow
     from echospline.tracking.region import grid_over, inside_ahead, region_ahead
+    from echospline.tracking.score import Score, score
     from echospline.tracking.tracker import (
         FlowTracker,
         Frame,
@@ -32,6 +33,7 @@ __all__ = [
     "Frame",
     "Frames",
     "Reference",
+    "Score",
     "Track",
     "Tracker",
     "grey_pair",
@@ -40,6 +42,7 @@ __all__ = [
     "levelled",
     "read_track",
     "region_ahead",
+    "score",
     "track",
     "write_track",
 ]

@@ -12,7 +12,16 @@ import SimpleITK
 
 from echospline.atomic import appearing
 from echospline.errors import InputError
-from echospline.io import LIMIT, MIB, DisplacementRecord, decoding, head, read_displacement
+from echospline.io import (
+    LIMIT,
+    MIB,
+    DisplacementRecord,
+    decoding,
+    head,
+    is_spatial_record,
+    read_displacement,
+    read_spatial_displacement,
+)
 from echospline.scene import Floats, NeedlePose, RegularGrid
 from echospline.tracking.tracker import Track
 
@@ -24,7 +33,7 @@ ABSENT = NeedlePose((0.0, 0.0), (0.0, 0.0), 0.0)
 
 @dataclass(frozen=True)
 class TrackRecord:
-    """Displacement, needle and confidence (frames, n), 1 where the file has none (a simulation)."""
+    """Displacement, needle and confidence (frames, n): 1 where the file has none (a simulation), 0 where tissue left the slice (in space)."""
 
     motion: DisplacementRecord
     confidence: Floats
@@ -84,6 +93,9 @@ def read_track(path: str | Path, *, limit: float = LIMIT) -> TrackRecord:
     if head(path).startswith(b"PK"):
         record = read_displacement(path, limit=limit)
         with decoding(path, "track"), np.load(path, allow_pickle=False) as archive:
+            if is_spatial_record(path):  # tissue that left the slice is not to be found in the picture
+                valid = read_spatial_displacement(path, limit=limit).picture_valid
+                return TrackRecord(record, valid.reshape(len(record), -1).astype(np.float64))
             if "confidence" not in archive.files:
                 return TrackRecord(record, np.ones(record.displacement.shape[:2]))
             confidence = _confidence(archive, path, record.displacement.shape[:2])
