@@ -84,7 +84,7 @@ inline void save_slip(const void* f, void* bytes) {
   p += sizeof header;
   for (int64_t j = 0; j < s.count; ++j, p += sizeof(SlipSaved)) {
     const SlipContact& c = s.contacts[j];
-    const SlipSaved saved = {{c.place[0], c.place[1]}, {c.axis[0], c.axis[1]}, c.friction, c.side, c.covered,
+    const SlipSaved saved = {{c.place[0], c.place[1]}, {c.axis[0], c.axis[1]}, c.friction, c.side[0], c.covered,
                              {c.moved[0], c.moved[1]}};
     std::memcpy(p, &saved, sizeof saved);
   }
@@ -136,12 +136,13 @@ inline echospline_status load_slip(void* f, const void* bytes, int64_t size, Mes
   own.drop_step();
   SlipState& s = own.state;
   s.directed = header.directed != 0, s.tip = point_of<2>(header.tip), s.axis = point_of<2>(header.axis);
+  s.frame = frame_of(s.axis);
   s.entry = point_of<2>(header.entry), s.depth = header.depth, s.push = header.push, s.cut = header.cut;
   s.count = count;
   for (int64_t j = 0; j < count; ++j) {
     SlipSaved saved;
     std::memcpy(&saved, p + sizeof header + j * static_cast<int64_t>(sizeof saved), sizeof saved);
-    s.contacts[j] = {point_of<2>(saved.place), point_of<2>(saved.axis), saved.friction, saved.side, saved.covered,
+    s.contacts[j] = {point_of<2>(saved.place), point_of<2>(saved.axis), saved.friction, {saved.side}, saved.covered,
                      point_of<2>(saved.moved)};
   }
   return ECHOSPLINE_OK;
