@@ -186,6 +186,10 @@ ECHOSPLINE_API echospline_status echospline_spatial_needle(echospline_spatial* s
  * written. */
 ECHOSPLINE_API echospline_status echospline_spatial_forces(echospline_spatial* spatial, double* forces, int64_t room,
                                                            int64_t* count);
+/* Where they act: the present state's stations. `count` is set to their number, and no more than `room` are written. */
+ECHOSPLINE_API echospline_status echospline_spatial_stations(echospline_spatial* spatial,
+                                                             echospline_spatial_station* stations, int64_t room,
+                                                             int64_t* count);
 /* Displacement of the present state, where the core answers: `field` is filled, and points into the tissue until its next call. */
 ECHOSPLINE_API echospline_status echospline_spatial_field(echospline_spatial* spatial, echospline_force_field* field);
 

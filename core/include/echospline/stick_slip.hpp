@@ -1,4 +1,5 @@
-// A needle that sticks, slips and cuts, in the plane (D = 2) or in space (D = 3): forces on tissue whose answer to a point of the track is supplied from outside.
+// A needle that sticks, slips and cuts, in the plane (D = 2) or in space (D = 3): forces on tissue whose answer to a point of the track is
+// supplied from outside.
 //
 // The law is that of `mechanics/stick_slip.py`, with the same names. `SlipTissue` keeps what the tissue answers to each station:
 // the displacement of the mesh by unit forces there (columns, single precision), and the mean displacement over the stations before
@@ -368,6 +369,21 @@ class SlipTissueIn {
   int64_t answers() const { return answers_; }
   const SlipStationIn<D>& station(int64_t j) const { return stations_[j]; }
 
+  /// Share of the tip's force at a station; the front lies between two.
+  double weight_at(double cut, int64_t count, int64_t j) const {
+    int64_t first = static_cast<int64_t>(cut / law.spacing);
+    if (first > count - 2) first = count - 2;
+    const double beyond = cut / law.spacing - static_cast<double>(first);
+    return j == first ? 1 - beyond : j == first + 1 ? beyond : 0;
+  }
+  /// Force at a station of a state, N.
+  Vec<D> force_of(const SlipStateIn<D>& s, int64_t j) const {
+    const SlipContactIn<D>& contact = s.contacts[j];
+    const double along = contact.friction + (s.count > 1 ? weight_at(s.cut, s.count, j) * s.push : 0);
+    Vec<D> f = along * s.axis;
+    for (int d = 0; d < D - 1; ++d) f = f + contact.side[d] * s.frame.n[d];
+    return f;
+  }
   /// Force at every station of the state, (count, D) N.
   void forces(double* out) const { forces_of(state, out); }
 
@@ -510,19 +526,6 @@ class SlipTissueIn {
     return i <= j ? rows_[j][D * D * i + D * c + d] : rows_[i][D * D * j + D * d + c];
   }
 
-  double weight_at(double cut, int64_t count, int64_t j) const {
-    int64_t first = static_cast<int64_t>(cut / law.spacing);
-    if (first > count - 2) first = count - 2;
-    const double beyond = cut / law.spacing - static_cast<double>(first);
-    return j == first ? 1 - beyond : j == first + 1 ? beyond : 0;
-  }
-  Vec<D> force_of(const SlipStateIn<D>& s, int64_t j) const {
-    const SlipContactIn<D>& contact = s.contacts[j];
-    const double along = contact.friction + (s.count > 1 ? weight_at(s.cut, s.count, j) * s.push : 0);
-    Vec<D> f = along * s.axis;
-    for (int d = 0; d < D - 1; ++d) f = f + contact.side[d] * s.frame.n[d];
-    return f;
-  }
   void forces_of(const SlipStateIn<D>& s, double* out) const {
     for (int64_t j = 0; j < s.count; ++j) {
       const Vec<D> f = force_of(s, j);
