@@ -65,7 +65,7 @@ test("a picture of a plane shows the tissue as the law moves it", { skip }, () =
   const [x, y, z] = [60, 50, 56];
   const voxels = Uint8Array.from({ length: x * y * z }, (_, i) => 128 + 100 * Math.sin(i / 3) * Math.cos(i / 170));
   const volume = core.volume({ shape: [x, y, z], spacing: [0.6, 0.6, 0.6], origin: [-17.7, 0.3, -16.5] }, voxels);
-  const plane = core.plane(volume, { columns: 60, rows: 60, spacing: [0.5, 0.5], origin: [-14.75, 0.25], step: 4 });
+  const plane = core.plane(volume, { columns: 60, rows: 60, spacing: [0.5, 0.5], origin: [-14.75, 0.25], step: 2 });
   const matrix = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, -1, 0, 0, 0, 1];
   const spatial = core.spatial(tables);
   const still = Array.from(plane.draw(matrix, null, null));
@@ -73,7 +73,7 @@ test("a picture of a plane shows the tissue as the law moves it", { skip }, () =
   const moved = Array.from(plane.draw(matrix, spatial.move(), null));
   assert.ok(gap(still, moved) > 20);
   const { residual, folded } = plane.traced();
-  assert.ok(residual < 0.1 && folded === 0);
+  assert.ok(residual < 0.3 && folded === 0, `${residual} mm, ${folded} folds`);
   for (const handle of [plane, spatial, volume]) handle.destroy();
 });
 

@@ -176,10 +176,16 @@ class SpaceGreen {
       const double* made = made_[j].data();
       for (int64_t r = 0; r < unknowns(); ++r)
         answer_[r] += made[3 * r] * f[0] + made[3 * r + 1] * f[1] + made[3 * r + 2] * f[2];
-      for (int k = 0; k < station.count; ++k, ++used) {
+      for (int k = 0; k < station.count; ++k) {
         const Vec<3> p = below(station.points[k]);
-        for (int d = 0; d < 3; ++d) place_[3 * used + d] = p[d], load_[3 * used + d] = station.weights[k] * f[d];
-        spread_[used] = radius_;
+        int64_t at = used;
+        for (int64_t other = used - 1; other >= 0 && other >= used - 4; --other)
+          if (coincide(p, &place_[3 * other])) at = other;
+        if (at == used) {
+          for (int d = 0; d < 3; ++d) place_[3 * at + d] = p[d], load_[3 * at + d] = 0;
+          spread_[used++] = radius_;
+        }
+        for (int d = 0; d < 3; ++d) load_[3 * at + d] += station.weights[k] * f[d];
       }
     }
     faces();
@@ -211,6 +217,13 @@ class SpaceGreen {
   Vec<3> below(Vec<3> p) const {
     if (top_ != Top::none && p[1] < radius_) p[1] = radius_;
     return p;
+  }
+
+  /// Whether two forces act in one place. The hats of neighbours overlap by two points of four: half of the forces are another's.
+  static bool coincide(const Vec<3>& p, const double* q) {
+    for (int d = 0; d < 3; ++d)
+      if (!(std::fabs(p[d] - q[d]) < 1e-9)) return false;
+    return true;
   }
 
   /// Rigid motion at a point: shifts along x, y, z and turns about them.

@@ -324,6 +324,7 @@ class SliceDrawing:
         grid = probe.grid
         columns, rows = grid.shape
         self._lattice = lattice_of(probe)
+        self._hides = not bool(probe.mask.all())
         self._spread = probe.thickness(grid.y) if probe.elevation > 0 else None
         span = ((columns - 1) * grid.spacing[0], (rows - 1) * grid.spacing[1])
         blank: Pixels = np.zeros((rows, columns), np.uint8)
@@ -367,7 +368,8 @@ class SliceDrawing:
         if pose is not None and needle is not None and pose.depth >= ZERO_LENGTH:
             self._picture.reference(pixels)
             pixels = self._picture.draw(needle.between(*pose.seen_from(plane), apex=self.probe.apex))
-            pixels[~self.probe.mask] = 0
+            if self._hides:
+                pixels *= self.probe.mask.view(np.uint8)
         done = perf_counter()
         return SliceDrawn(
             UltrasoundImage(pixels, grid, self.volume.source),
