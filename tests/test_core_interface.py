@@ -224,7 +224,8 @@ def test_no_level_leaves_a_symbol_that_another_might_take():
 @pytest.mark.skipif(not WASM.exists(), reason="echospline.wasm is not built; run make wasm")
 def test_webassembly_is_small_and_needs_nothing():
     build.check_wasm(WASM)
-    assert len(zlib.compress(WASM.read_bytes(), 9)) < 200_000  # as a page packs it, both precisions included
+    # as a page packs it: both precisions, Green's function and scenes in space included; in base64 a third of a page's megabyte
+    assert len(zlib.compress(WASM.read_bytes(), 9)) < 230_000
     names = set(re.findall(rb"echospline_\w+", WASM.read_bytes()))
     assert {name.encode() for name in declared(ALL)} <= names
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import json
 import os
+import pickle
 import re
 import shutil
 import subprocess
@@ -82,6 +83,15 @@ def test_a_session_without_the_host_is_the_references(name):
     assert worst < 2e-6
     assert worst_at < 2e-6
     assert attached.load().tip == pytest.approx(state.load.tip, abs=1e-7)
+
+
+@pytest.mark.parametrize("name", ["lesion", "polygon"])
+def test_a_response_pickles_after_use(name):
+    response = made(name)
+    expected = response.answer(PLACES, cases(1), POINTS)
+    copy = pickle.loads(pickle.dumps(response))
+    for found, true in zip(copy.answer(PLACES, cases(1), POINTS), expected, strict=True):
+        np.testing.assert_array_equal(found, true)
 
 
 @pytest.mark.parametrize("name", ["sliding top", "polygon"])
