@@ -58,7 +58,9 @@ def set_up() -> tuple[SpatialForceModel, SliceDrawing]:
     return model, SliceDrawing(volume(), LINEAR)
 
 
-def measure(model: SpatialForceModel, drawing: SliceDrawing, path: str, moved: bool, frames: int) -> dict[str, float]:
+def measure(
+    model: SpatialForceModel, drawing: SliceDrawing, path: str, moved: bool, frames: int
+) -> dict[str, float]:
     """Medians over the frames after the first half second."""
     insertion, state, echo = PATHS[path], model.rest(), NeedleEcho()
     picture = np.random.default_rng(1).integers(0, 256, (512, 512), dtype=np.uint8)
@@ -78,7 +80,15 @@ def measure(model: SpatialForceModel, drawing: SliceDrawing, path: str, moved: b
         done, worked = perf_counter(), thread_time()
         cv2.remap(picture, x, y, cv2.INTER_LINEAR, dst=out)
         remap, remapped = perf_counter() - done, thread_time() - worked
-        stages.append([1e3 * (stepped - began), 1e3 * (summed - stepped), *drawn.milliseconds.values(), 1e3 * (done - began), 1e3 * remap])
+        stages.append(
+            [
+                1e3 * (stepped - began),
+                1e3 * (summed - stepped),
+                *drawn.milliseconds.values(),
+                1e3 * (done - began),
+                1e3 * remap,
+            ]
+        )
         ratios.append(((done - began) / remap, (worked - busy) / remapped))
     names = ["step", "field", *drawn.milliseconds, "frame", "remap"]
     times = dict(zip(names, np.median(stages[WARM:], axis=0).tolist(), strict=True))
@@ -112,7 +122,11 @@ def main() -> None:
             )
             return
         rows = [
-            {"path": path, "probe": "moved" if moved else "held", **measure(model, drawing, path, moved, given.frames)}
+            {
+                "path": path,
+                "probe": "moved" if moved else "held",
+                **measure(model, drawing, path, moved, given.frames),
+            }
             for path in PATHS
             for moved in (False, True)
         ]
@@ -120,8 +134,13 @@ def main() -> None:
         print(json.dumps(rows))
         return
     for row in rows:
-        stages = "  ".join(f"{name} {row[name]:.2f}" for name in ("step", "field", "inverse", "slice", "needle", "frame", "p99", "remap"))
-        print(f"{row['path']:13} {row['probe']:6} {stages} ms  {row['remaps']:.1f} remaps, {row['processor']:.1f} of processor time  residual {row['residual']:.2f} px")
+        stages = "  ".join(
+            f"{name} {row[name]:.2f}"
+            for name in ("step", "field", "inverse", "slice", "needle", "frame", "p99", "remap")
+        )
+        print(
+            f"{row['path']:13} {row['probe']:6} {stages} ms  {row['remaps']:.1f} remaps, {row['processor']:.1f} of processor time  residual {row['residual']:.2f} px"
+        )
 
 
 if __name__ == "__main__":

@@ -71,7 +71,8 @@ inline Response3<T> kelvinlet(const T (&d)[3], double nu, double spread) {
 
 /// A unit force at a source below the surface, spread over a radius (spread: its square), and its image.
 template <class T>
-inline Response3<T> response_in_space(const T (&p)[3], const double* source, double nu, double spread, Top top) {
+__attribute__((noinline)) Response3<T> response_in_space(const T (&p)[3], const double* source, double nu,
+                                                         double spread, Top top) {
   const double c = source[1], a = 3 - 4 * nu;
   const T d[3] = {p[0] - source[0], p[1] - c, p[2] - source[2]};
   Response3<T> G = kelvinlet(d, nu, spread);
@@ -104,7 +105,7 @@ inline Response3<T> response_in_space(const T (&p)[3], const double* source, dou
 class SpaceGreen {
  public:
   /// Copy the tables; false when memory runs out. Numbers have been checked.
-  bool prepare(const echospline_spatial_options& o) {
+  ECHOSPLINE_SET_UP bool prepare(const echospline_spatial_options& o) {
     top_ = o.top == ECHOSPLINE_TOP_FREE ? Top::free : o.top == ECHOSPLINE_TOP_SLIDING ? Top::sliding : Top::none;
     nu_ = o.poisson, mu_ = o.shear_modulus, radius_ = o.radius, source_radius_ = o.source_radius;
     scale_ = 1 / (16 * 3.14159265358979323846 * mu_ * (1 - nu_));
@@ -132,7 +133,7 @@ class SpaceGreen {
       for (int y = 0; y < shape_[1]; ++y)
         for (int x = 0; x < shape_[0]; ++x, i += 3)
           point_[i] = origin_[0] + spacing_[0] * x, point_[i + 1] = origin_[1] + spacing_[1] * y,
-                 point_[i + 2] = origin_[2] + spacing_[2] * z;
+          point_[i + 2] = origin_[2] + spacing_[2] * z;
     return true;
   }
   int64_t unknowns() const { return 3 * sources_ + motions_; }
@@ -163,8 +164,8 @@ class SpaceGreen {
   bool field(const SlipTissueIn<3>& tissue, echospline_force_field& out) {
     const int64_t count = tissue.state.count;
     if (forces_.size() < 3 * count && !forces_.reserve(3 * (count + 32))) return false;
-    if (place_.size() < 12 * count && (!place_.reserve(12 * (count + 32)) || !load_.reserve(12 * (count + 32)) ||
-                                       !spread_.reserve(4 * (count + 32))))
+    if (place_.size() < 12 * count &&
+        (!place_.reserve(12 * (count + 32)) || !load_.reserve(12 * (count + 32)) || !spread_.reserve(4 * (count + 32))))
       return false;
     tissue.forces(forces_.data());
     for (int64_t r = 0; r < unknowns(); ++r) answer_[r] = 0;
@@ -191,7 +192,9 @@ class SpaceGreen {
     faces();
     std::memset(&out, 0, sizeof out);
     out.struct_size = sizeof out;
-    out.top = top_ == Top::free ? ECHOSPLINE_TOP_FREE : top_ == Top::sliding ? ECHOSPLINE_TOP_SLIDING : ECHOSPLINE_TOP_NONE;
+    out.top = top_ == Top::free      ? ECHOSPLINE_TOP_FREE
+              : top_ == Top::sliding ? ECHOSPLINE_TOP_SLIDING
+                                     : ECHOSPLINE_TOP_NONE;
     out.poisson = nu_, out.shear_modulus = mu_;
     out.places = place_.data(), out.forces = load_.data(), out.radii = spread_.data(), out.force_count = used;
     for (int k = 0; k < 3; ++k)
@@ -313,8 +316,12 @@ class SpaceGreen {
     const float spread = static_cast<float>(source_radius_ * source_radius_);
     for (int64_t m = 0; m < sources_; ++m) {
       const double *s = &source_[3 * m], *f = &answer_[3 * m];
-      outer_[m] = {static_cast<float>(s[0]),          static_cast<float>(s[1]),          static_cast<float>(s[2]),
-                   static_cast<float>(f[0] * scale_), static_cast<float>(f[1] * scale_), static_cast<float>(f[2] * scale_),
+      outer_[m] = {static_cast<float>(s[0]),
+                   static_cast<float>(s[1]),
+                   static_cast<float>(s[2]),
+                   static_cast<float>(f[0] * scale_),
+                   static_cast<float>(f[1] * scale_),
+                   static_cast<float>(f[2] * scale_),
                    spread};
     }
     const SpaceField sum = {outer_.data(), sources_, static_cast<float>(nu_), top_, nullptr};

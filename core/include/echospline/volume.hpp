@@ -48,7 +48,8 @@ class Volume {
     const int across = (s.columns - 1 + s.step - 1) / s.step + 1, lines = (s.rows - 1 + s.step - 1) / s.step + 1;
     const int cells = larger(across - 1, 1), padded = cells * s.step + 2 * LANES;
     Array<float> shares, line, places;
-    if (!shares.reserve(s.step + 1 + LANES) || !line.reserve(3 * int64_t(across + 1)) || !places.reserve(3 * int64_t(padded)))
+    if (!shares.reserve(s.step + 1 + LANES) || !line.reserve(3 * int64_t(across + 1)) ||
+        !places.reserve(3 * int64_t(padded)))
       return -1;
     for (int k = 0; k < s.step + 1 + LANES; ++k) shares[k] = static_cast<float>(k) / static_cast<float>(s.step);
     const int stride = across + 1;

@@ -334,7 +334,7 @@ class SliceDrawing:
     def draw(
         self,
         plane: ImagingPlane,
-        field: Field | None = None,
+        field: Field | CoreField | None = None,
         pose: SpatialPose | None = None,
         needle: NeedleEcho | None = None,
     ) -> SliceDrawn:
@@ -367,7 +367,7 @@ class SliceDrawing:
             self._picture.reference(pixels)
             pixels = self._picture.draw(needle.between(*pose.seen_from(plane), apex=self.probe.apex))
             if self._hides:
-                pixels *= self.probe.mask.view(np.uint8)
+                np.multiply(pixels, self.probe.mask, out=pixels)
         done = perf_counter()
         return SliceDrawn(
             UltrasoundImage(pixels, grid, self.volume.source),
@@ -383,7 +383,7 @@ class SliceDrawing:
         )
 
     def _undo(
-        self, places: Floats, field: Field, pose: SpatialPose | None
+        self, places: Floats, field: Field | CoreField, pose: SpatialPose | None
     ) -> tuple[Floats, float, SpatialFolds | None]:
         """Return origins of the lattice, the residual midway between its points, and folds."""
         pixel = min(self.probe.grid.spacing)
