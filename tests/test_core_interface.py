@@ -225,7 +225,7 @@ def test_no_level_leaves_a_symbol_that_another_might_take():
 def test_webassembly_is_small_and_needs_nothing():
     build.check_wasm(WASM)
     # as a page packs it: both precisions, Green's function and scenes in space included; in base64 a third of a page's megabyte
-    assert len(zlib.compress(WASM.read_bytes(), 9)) < 230_000
+    assert len(zlib.compress(WASM.read_bytes(), 9)) < 240_000
     names = set(re.findall(rb"echospline_\w+", WASM.read_bytes()))
     assert {name.encode() for name in declared(ALL)} <= names
 
