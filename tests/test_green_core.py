@@ -145,6 +145,14 @@ WRONG = {
     "a point outside": ("clamped points", {"pins": np.array([[50.0, 3.0]])}, "pins must lie in the tissue"),
     "lines": ("polygon", {"lines_x": np.array([0.0, 3.0, 2.0, 40.0])}, "must ascend"),
     "fewer moduli": ("polygon", {"moduli": np.ones((4, 2))}, "triangles"),
+    "more than is factored in time": (
+        "layer and lesion",
+        {
+            "conditions": np.tile([20.0, 0.0, 0.0, -1.0], (60_000, 1)),
+            "sides": np.tile([0, 0, -1], (60_000, 1)),
+        },
+        "for they are factored",
+    ),
     "fewer sides": ("lesion", {"sides": np.zeros((4, 3), dtype=np.int32)}, "sides of green must have"),
     "fewer source counts": ("lesion", {"source_counts": np.array([9])}, "source_counts of green must have"),
     "half an entry": ("lesion", {"sources": np.ones(7)}, "2 per entry"),
