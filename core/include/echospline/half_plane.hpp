@@ -14,9 +14,6 @@ namespace echospline::ECHOSPLINE_CORE {
 constexpr double CIRCLE = 6.283185307179586477;  // 2 pi
 constexpr double SHALLOWEST = 1.0;               // radii: least depth of a force below a free or clamped top
 
-/// Set-up runs once: these functions are compiled for size.
-#define ECHOSPLINE_SET_UP __attribute__((noinline, cold))
-
 /// Angle in the right half plane to 3e-16: nearest of three known ones, and the series of what is left (below tan pi / 16).
 ECHOSPLINE_INLINE Doubles arctangent(Doubles t) {
   const Doubles size = greatest(t, -t), one = all(1.0);

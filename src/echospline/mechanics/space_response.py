@@ -14,6 +14,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from echospline import _native as core
 from echospline._native import space
@@ -286,7 +287,7 @@ class SpaceResponse:
             answer += column.made @ f
         places = np.concatenate([np.zeros((0, 3)), *(c.places for c, _ in loaded)])
         loads = np.concatenate([np.zeros((0, 3)), *(np.outer(c.weights, f) for c, f in loaded)])
-        return self._summed(places, loads, answer)
+        return self._summed(*merged(places, loads), answer)
 
     def warnings(self, columns: Sequence[SpatialColumn], forces: Floats) -> dict[str, str]:
         """Say where forces (k, 3) in N of the columns are more than tissue bears without |grad u| above 1."""
@@ -331,6 +332,31 @@ class SpaceResponse:
         """Displacement of points (p, 3, k) in mm under k load cases, without the mesh."""
         fields = [self.field(places, forces[:, :, k])(points) for k in range(forces.shape[2])]
         return np.stack(fields, axis=2) if fields else np.zeros((len(points), 3, 0))
+
+    def tables(self) -> dict[str, int | float | Floats | NDArray[np.uint32]]:
+        """Return what the core needs to answer in this response's place, named as in ``echospline_spatial_options``; arrays are flat."""
+        faces = [np.full(len(points), _bit(face), dtype=np.uint32) for face, points in self.rows.items()]
+        spacing, origin, shape, _ = self._lattice
+        low, high = self.grid.corners
+        return {
+            "low": low,
+            "high": high,
+            "top": int(TOPS[self.top]),
+            "clamped": sum(_bit(face) for face, kind in self.kinds.items() if kind == "clamped"),
+            "sliding": sum(_bit(face) for face, kind in self.kinds.items() if kind == "sliding"),
+            "poisson": self.tissue.poisson,
+            "shear_modulus": self.mu,
+            "radius": self.radius,
+            "source_radius": 1e-3 * self.spacing,
+            "traction_length": TRACTION,
+            "sources": self.sources.ravel(),
+            "conditions": np.concatenate(list(self.rows.values())).ravel(),
+            "condition_faces": np.concatenate(faces),
+            "answers": self._solve.ravel(),
+            "lattice_shape": np.array(shape, dtype=np.uint32),
+            "lattice_spacing": spacing,
+            "lattice_origin": origin,
+        }
 
     def describe(self) -> str:
         """Return in one sentence how the tissue is solved."""
@@ -441,6 +467,25 @@ class SpaceResponse:
             lines.append(first + (share**2 if under and self.top == "free" else share) * (last - first))
         Z, Y, X = np.meshgrid(*lines[::-1], indexing="ij")
         return np.stack([X.ravel(), Y.ravel(), Z.ravel()], axis=1)
+
+
+def merged(places: Floats, loads: Floats) -> tuple[Floats, Floats]:
+    """Add up forces (m, 3) that act in one place (m, 3), as every second of a straight track does.
+
+    A station's hat has four places, half a spacing apart; its last two are the first two of the next one, two places later in the row.
+    """
+    again = np.zeros(len(places), dtype=bool)
+    again[2:] = (np.abs(places[2:] - places[:-2]) < 1e-9).all(axis=1)
+    total = loads.copy()
+    for i in np.flatnonzero(again)[::-1]:
+        total[i - 2] += total[i]
+    return places[~again], total[~again]
+
+
+def _bit(face: str) -> int:
+    """Bit of a face in the core."""
+    axis, side = SIDES[face]
+    return 1 << (2 * axis + int(side))
 
 
 def shear_modulus(young: float, poisson: float) -> float:
