@@ -394,11 +394,28 @@ class OutputSection(Section):
         return self
 
 
+EchoKind = Literal["hypoechoic", "anechoic", "hyperechoic"]
+
+
 class DiscSection(Section):
     """A round structure; it moves with the tissue."""
 
     centre: Point = Field(description="where it lies at rest (x lateral, y depth), mm")
     radius: Millimetres = Field(gt=0, le=100, description="mm")
+    imaged: bool = Field(
+        False, description="the picture shows it as a scanner would: a target hypoechoic, a vessel anechoic"
+    )
+    echo: EchoKind | None = Field(
+        None, description="imaged with this echo: hypoechoic, anechoic or hyperechoic"
+    )
+    young: Kilopascals | None = Field(
+        None, gt=0, description="Young's modulus, kPa, where it is stiffer or softer than the tissue"
+    )
+
+    @property
+    def shown(self) -> bool:
+        """Whether the picture itself shows it."""
+        return self.imaged or self.echo is not None
 
 
 class ExerciseSection(Section):
