@@ -22,6 +22,7 @@ COMMANDS = {
     "identify": "Find the parameters with which a model fits the observed displacement.",
     "study": "Regenerate the paper's study: Fig. 2, 3a, 3b, tables (CSV, JSON) and one self-contained report.html.",
     "live": "Steer the needle in the browser and see the tissue move.",
+    "page": "Write a scene as one file that simulates: it opens by a double click, offline, on a laptop or a phone.",
     "sessions": "Training sessions: list, export, score again, make a cine.",
     "link": "Join the network of 3D Slicer and PLUS: transforms move the needle, the deforming image comes back.",
     "reconstruct": "Make a volume from a tracked sweep: every picture is put where the probe was, and small gaps are filled.",

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from echospline.menu import on_demand
 
 if TYPE_CHECKING:  # the menu, loaded on demand
+    from echospline.scenario.core_models import landmark_scene, landmark_steps
     from echospline.scenario.models import MODELS, build_model
     from echospline.scenario.run import run
     from echospline.scenario.scale import (
@@ -32,6 +33,8 @@ __all__ = [
     "check_store",
     "describe",
     "is_spatial",
+    "landmark_scene",
+    "landmark_steps",
     "load",
     "needle_doubts",
     "open_spatial",
