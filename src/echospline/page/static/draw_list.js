@@ -46,7 +46,7 @@ export function drawList(state, live, say) {
     { draw: "clip", area: view.area },
     ...(helps.rings && exercise ? rings(view, live, exercise, say) : []),
     ...(helps.guide ? guide(view, live, state) : []),
-    ...(live.expert ? expert(view, live.expert, say) : []),
+    ...(live.expert ? expertNeedle(view, live.expert, say) : []),
     ...calipers(view, state),
     ...notes(view, state),
     { draw: "clip", area: null },
@@ -112,7 +112,7 @@ function guide(view, { entry, tip }, { needle }) {
 }
 
 /** @param {View} view @param {NonNullable<Live["expert"]>} expert @param {Say} say @returns {DrawCommand[]} */
-function expert(view, { entry, tip }, say) {
+function expertNeedle(view, { entry, tip }, say) {
   const [a, b] = [view.toScreen(entry), view.toScreen(tip)];
   return [
     { draw: "line", points: [a, b], ink: EXPERT, width: 2, halo: true, dash: [3, 4] },
@@ -140,8 +140,11 @@ function hub(view, { entry }, { needle }) {
 }
 
 /** @param {View} view @param {State} state @returns {DrawCommand[]} */
-function calipers(view, { calipers: kept, drawing }) {
-  return [...kept, ...(drawing ? [drawing] : [])].flatMap(({ a, b }, k) => {
+function calipers(view, { calipers: kept, drawing, cursor }) {
+  const [x, y] = cursor ? view.toScreen(cursor) : [0, 0];
+  /** @type {DrawCommand[]} */
+  const crosshair = cursor ? [{ draw: "line", points: [[x - 9, y], [x + 9, y]], ink: CALIPER, width: 1, halo: true }, { draw: "line", points: [[x, y - 9], [x, y + 9]], ink: CALIPER, width: 1, halo: true }] : [];
+  return [...crosshair, ...[...kept, ...(drawing ? [drawing] : [])].flatMap(({ a, b }, k) => {
     const [p, q] = [view.toScreen(a), view.toScreen(b)];
     const cross = (/** @type {Point} */ [x, y]) => /** @type {DrawCommand[]} */ ([
       { draw: "line", points: [[x - 5, y], [x + 5, y]], ink: CALIPER, width: 1.5, halo: true }, { draw: "line", points: [[x, y - 5], [x, y + 5]], ink: CALIPER, width: 1.5, halo: true },
@@ -151,7 +154,7 @@ function calipers(view, { calipers: kept, drawing }) {
       /** @type {DrawCommand} */ ({ draw: "line", points: [p, q], ink: CALIPER, width: 1.25, dash: [2, 4], halo: true }), ...cross(p), ...cross(q),
       /** @type {DrawCommand} */ ({ draw: "text", at: [(p[0] + q[0]) / 2 + 8, (p[1] + q[1]) / 2 - 10], text: length, ink: CALIPER, size: 13, bold: true }),
     ];
-  });
+  })];
 }
 
 /** @param {View} view @param {State} state @returns {DrawCommand[]} */

@@ -13,7 +13,7 @@ import { readPack } from "./scene.js";
  */
 /**
  * What a model gives to the engine.
- * @typedef {{ reset: () => void, advance: (pose: Pose) => void, deform: (picture: Picture) => void, at: (points: number[]) => ArrayLike<number>, destroy: () => void }} Solver
+ * @typedef {{ reset: () => void, advance: (pose: Pose) => void, deform: (picture: Picture) => void, at: (points: number[]) => ArrayLike<number>, save: () => Uint8Array, load: (saved: Uint8Array) => void, destroy: () => void }} Solver
  */
 
 /** dB that the grey levels of a recorded picture are taken to span. */
@@ -90,6 +90,39 @@ export class Engine {
     return pose;
   }
 
+  /** Tissue and needle now, to come back to. @returns {{ pose: Pose, tissue: Uint8Array }} */
+  save() {
+    return { pose: this.pose, tissue: this.solver.save() };
+  }
+
+  /** @param {{ pose: Pose, tissue: Uint8Array }} saved */
+  load(saved) {
+    this.solver.load(saved.tissue);
+    this.pose = saved.pose;
+    this.stale = true;
+  }
+
+  /**
+   * Run recorded poses through a model of its own, from rest; the engine stays as it is.
+   * @param {string} name @param {Float64Array} poses rows of [entry, tip, speed] @param {number} rate steps per second @param {number[]} places flat, mm
+   * @returns {Float64Array} where the places lie after every row
+   */
+  retrace(name, poses, rate, places) {
+    const entry = this.pack.models.find((model) => model.name === name);
+    if (!entry) throw new Error(`This scene has no model ${JSON.stringify(name)}.`);
+    const solver = solverOf(this.core, this.pack, entry), rows = poses.length / 5, watched = new Float64Array(rows * places.length);
+    try {
+      for (let row = 0; row < rows; ++row) {
+        solver.advance(poseOf(poses, row, 1 / rate));
+        const moved = solver.at(places);
+        for (let k = 0; k < places.length; ++k) watched[row * places.length + k] = places[k] + moved[k];
+      }
+    } finally {
+      solver.destroy();
+    }
+    return watched;
+  }
+
   /** Displacement of reference points, mm. @param {number[]} points flat @returns {ArrayLike<number>} flat */
   displacementAt(points) {
     return points.length ? this.solver.at(points) : [];
@@ -116,6 +149,12 @@ export class Engine {
   }
 }
 
+/** A recorded pose. @param {Float64Array} poses rows of [entry x, y, tip x, y, speed] @param {number} row @param {number} dt s @returns {Pose} */
+export function poseOf(poses, row, dt) {
+  const k = 5 * row;
+  return { entry: [poses[k], poses[k + 1]], tip: [poses[k + 2], poses[k + 3]], speed: poses[k + 4], dt };
+}
+
 /** The needle out of the tissue. @param {Pack} pack @returns {Pose} */
 function home(pack) {
   return { entry: [...pack.needle.entry], tip: [...pack.needle.entry], speed: 0, dt: 1 / pack.rate };
@@ -131,6 +170,8 @@ function solverOf(core, pack, model) {
     advance: (pose) => tissue.advance(pose),
     deform: (picture) => picture.follow(tissue),
     at: (points) => tissue.displacementAt(points),
+    save: () => tissue.save(),
+    load: (saved) => tissue.load(saved),
     destroy: () => {
       tissue.destroy();
       scene.destroy();

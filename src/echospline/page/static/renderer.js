@@ -43,7 +43,7 @@ export class Renderer {
       if (command.draw === "clip") {
         if (clipped) c.restore();
         clipped = command.area !== null;
-        if (command.area) clip(c, command.area);
+        if (command.area) clipTo(c, command.area);
       } else this.one(command);
     }
     if (clipped) c.restore();
@@ -57,7 +57,7 @@ export class Renderer {
       c.fillRect(0, 0, this.canvas.width / this.ratio, this.canvas.height / this.ratio);
     } else if (command.draw === "picture") {
       if (!this.small) return;
-      clip(c, command.area);
+      clipTo(c, command.area);
       if (command.flip) {
         c.translate(2 * command.left + command.width, 0);
         c.scale(-1, 1);
@@ -125,7 +125,7 @@ export class Renderer {
 }
 
 /** Draw inside an area until restore. @param {CanvasRenderingContext2D} c @param {Area} area */
-function clip(c, { left, top, right, bottom }) {
+function clipTo(c, { left, top, right, bottom }) {
   c.save();
   c.beginPath();
   c.rect(left, top, right - left, bottom - top);

@@ -1,7 +1,7 @@
 // The scene that a page shows: a pack of bytes, read and checked. Nothing of it is believed before it has been looked at.
 
 const MAGIC = "ECHOPACK";
-const MOST_PIXELS = 4096 * 4096, MOST_VOXELS = 512 ** 3, MOST_NODES = 500_000, MOST_MODELS = 8, MOST_EXERCISES = 100, MOST_VESSELS = 20;
+const MOST_PIXELS = 4096 * 4096, MOST_VOXELS = 512 ** 3, MOST_NODES = 1_000_000, MOST_MODELS = 8, MOST_EXERCISES = 100, MOST_VESSELS = 20;
 const LONGEST_MANIFEST = 4 << 20; // bytes
 const ARRAY_TYPES = { uint8: Uint8Array, float32: Float32Array, float64: Float64Array, int32: Int32Array, int64: BigInt64Array };
 
@@ -169,7 +169,7 @@ function arrayView(bytes, start, name, entry) {
     throw new PackError(`The scene is cut short: its array ${shown(name)} ends at byte ${start + offset + size} of ${bytes.length}. Make the page anew.`);
   }
   const at = bytes.byteOffset + start + offset;
-  return at % type.BYTES_PER_ELEMENT === 0 ? new type(bytes.buffer, at, count) : new type(bytes.slice(start + offset, start + offset + size).buffer, 0, count);
+  return at % type.BYTES_PER_ELEMENT === 0 ? new type(/** @type {ArrayBuffer} */ (bytes.buffer), at, count) : new type(bytes.slice(start + offset, start + offset + size).buffer, 0, count);
 }
 
 /** @param {Values} values @param {Function} type @param {number} count @param {string} what */
@@ -194,7 +194,7 @@ export function asList(value, what, least, most) {
 }
 
 /** @param {unknown} value @param {string} what @param {number} low @param {number} high @returns {number} */
-export function asNumber(value, what, low = -1e6, high = 1e6) {
+export function asNumber(value, what, low = -1e9, high = 1e9) {
   if (typeof value !== "number" || !Number.isFinite(value) || value < low || value > high) throw new PackError(`Expected a number from ${low} to ${high} for ${what}; got ${shown(value)}.`);
   return value;
 }

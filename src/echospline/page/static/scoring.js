@@ -75,12 +75,13 @@ function triangleArea(p, a, b, c) {
 /** Rows at which a turn inside the tissue exceeds TURN; one turn lasts until the needle holds still. @param {Trace} trace @param {Uint8Array} inside @returns {number[]} */
 export function redirectionsOf({ poses, period }, inside) {
   const rest = Math.max(1, roundHalfEven(TURN_REST / period)), found = [];
-  let held = 0, turning = false, still = 0, before = 0, angle = 0;
+  let held = 0, turning = false, still = 0, before = 0, whole = 0, degreesBefore = 0;
   for (let row = 0; row < inside.length; ++row) {
     const k = ROW * row, raw = Math.atan2(poses[k + 3] - poses[k + 1], poses[k + 2] - poses[k]);
-    angle = row ? angle + wrapped(raw - before) : raw;
-    const moved = row ? Math.abs((wrapped(raw - before) * 180) / Math.PI) : 0, degrees = (angle * 180) / Math.PI;
+    if (row) whole += unwrapping(raw - before);
+    const degrees = ((raw + whole) * 180) / Math.PI, moved = Math.abs(degrees - degreesBefore);
     before = raw;
+    degreesBefore = degrees;
     if (!inside[row] || (row && !inside[row - 1])) {
       held = degrees;
       turning = false;
@@ -140,10 +141,11 @@ export function rises(flag) {
   return flag.reduce((count, on, row) => count + Number(on && !(row && flag[row - 1])), 0);
 }
 
-/** A difference of angles between -pi and pi, as numpy.unwrap takes it. @param {number} turn radians */
-function wrapped(turn) {
+/** What numpy.unwrap adds to the angles from here on, by the difference from the one before; radians. @param {number} turn */
+function unwrapping(turn) {
+  if (Math.abs(turn) < Math.PI) return 0;
   const whole = 2 * Math.PI, inner = (((turn + Math.PI) % whole) + whole) % whole - Math.PI;
-  return inner === -Math.PI && turn > 0 ? Math.PI : inner;
+  return (inner === -Math.PI && turn > 0 ? Math.PI : inner) - turn;
 }
 
 /** Round as Python does. @param {number} value */

@@ -16,7 +16,7 @@ import { viewOf, zoomed } from "./view.js";
  * @typedef {{
  *   extent: Extent, rate: number, home: NeedleState, exercises: Exercise[], models: string[],
  *   needle: NeedleState, view: ViewState, look: Look, help: { guide: boolean, rings: boolean, readouts: boolean },
- *   tool: "needle" | "caliper" | "note", calipers: Caliper[], drawing: Caliper | null, notes: Note[],
+ *   tool: "needle" | "caliper" | "note", calipers: Caliper[], drawing: Caliper | null, cursor: Point | null, notes: Note[],
  *   model: string, frozen: boolean, chosen: string, examination: boolean, entryRule: EntryRule, run: Run | null, replay: Replay | null,
  *   touched: boolean, language: string, theme: "dark" | "light"
  * }} State
@@ -39,7 +39,7 @@ export function initialState(pack, kept = {}) {
     extent, rate: pack.rate, home, exercises: pack.exercises, models: pack.models.map((model) => model.name), needle: home,
     view: { width: 800, height: 600, zoom: 1, pan: [0, 0], flip: false, depth: extent.y1 - extent.y0 },
     look: { gain: 0, timeGain: Array(TIME_GAINS).fill(0), dynamicRange: 60, invert: false },
-    help: { guide: true, rings: true, readouts: true }, tool: "needle", calipers: [], drawing: null, notes: [], model: pack.models[0].name,
+    help: { guide: true, rings: true, readouts: true }, tool: "needle", calipers: [], drawing: null, cursor: null, notes: [], model: pack.models[0].name,
     frozen: false, chosen: pack.exercises[0]?.name ?? "", examination: false, entryRule: "free", run: null, replay: null, touched: false,
     language: "en", theme: "dark", ...kept,
   };
@@ -133,6 +133,13 @@ function drawnOut(state) {
   return { ...state, needle: { ...state.needle, depth: 0 }, frozen: false };
 }
 
+/** Move the cursor of marks, from the middle of the picture at first. @param {State} state @param {Point} [at] @param {Point} [by] mm @returns {State} */
+function cursorMoved(state, at, by = [0, 0]) {
+  const { x0, x1, y0, y1 } = state.extent, now = at ?? state.cursor ?? [(x0 + x1) / 2, y0 + state.view.depth / 2];
+  const cursor = /** @type {Point} */ ([between(now[0] + by[0], x0, x1), between(now[1] + by[1], y0, y1)]);
+  return { ...state, cursor, drawing: state.drawing && !at ? { a: state.drawing.a, b: cursor } : state.drawing };
+}
+
 /** @type {Record<string, (state: State, action: Action) => State>} */
 const CHANGES = {
   // the needle
@@ -164,14 +171,19 @@ const CHANGES = {
   help: (s, { name }) => ({ ...s, help: { ...s.help, [name]: !s.help[/** @type {"guide"} */ (name)] } }),
   freeze: (s) => (s.run ? s : { ...s, frozen: !s.frozen }),
   // marks on the picture
-  tool: (s, { name }) => ({ ...s, tool: s.tool === name ? "needle" : name, drawing: null }),
+  tool: (s, { name }) => ({ ...s, tool: s.tool === name ? "needle" : name, drawing: null, cursor: null }),
+  cursor: (s, { at, by }) => cursorMoved(s, at, by),
+  mark: (s) => {
+    if (s.tool !== "caliper" || !s.cursor) return s;
+    return s.drawing ? { ...CHANGES.measured(s, { do: "measured" }), cursor: s.cursor } : { ...s, drawing: { a: s.cursor, b: s.cursor } };
+  },
   measure: (s, { a, b }) => ({ ...s, drawing: { a, b } }),
   measured: (s) => {
     const long = s.drawing && Math.hypot(s.drawing.b[0] - s.drawing.a[0], s.drawing.b[1] - s.drawing.a[1]) * viewOf(s.view, s.extent).scale >= 3;
     return { ...s, calipers: s.drawing && long ? [...s.calipers, s.drawing].slice(-MOST_CALIPERS) : s.calipers, drawing: null };
   },
-  note: (s, { at, text }) => ({ ...s, notes: text.trim() ? [...s.notes, { at, text: text.trim().slice(0, LONGEST_NOTE) }].slice(-MOST_NOTES) : s.notes, tool: "needle" }),
-  clear: (s) => ({ ...s, calipers: [], notes: [], drawing: null, tool: "needle" }),
+  note: (s, { at, text }) => ({ ...s, notes: text.trim() ? [...s.notes, { at, text: text.trim().slice(0, LONGEST_NOTE) }].slice(-MOST_NOTES) : s.notes, tool: "needle", cursor: null }),
+  clear: (s) => ({ ...s, calipers: [], notes: [], drawing: null, cursor: null, tool: "needle" }),
   // model, appearance of the page
   model: (s, { name }) => (s.run || s.replay || !s.models.includes(name) ? s : { ...s, model: name }),
   language: (s, { name }) => ({ ...s, language: name }),
@@ -187,7 +199,7 @@ const CHANGES = {
   entryRule: (s, { rule }) => (s.run ? s : { ...s, entryRule: rule }),
   start: (s, { lot }) => started(s, lot),
   stepped: (s, { steps }) => (s.run ? { ...s, run: { ...s.run, steps } } : s),
-  stop: (s) => ({ ...drawnOut(s), run: null }),
+  stop: (s) => ({ ...s, run: null }),
   // replay
   replay: (s, { replay }) => ({ ...s, frozen: false, run: null, model: replay.model, replay: { at: 0, speed: 1, paused: false, ...replay } }),
   scrub: (s, { at }) => replayed(s, { at: between(at, 0, s.replay?.length ?? 0) }),
@@ -212,7 +224,7 @@ function started(state, lot) {
   const given = exercise.entry ?? (rule === "fixed" ? state.home.entry : rule === "drawn" ? [x0 + (0.15 + 0.7 * lot) * (x1 - x0), y0] : null);
   const needle = { ...state.needle, depth: 0, entry: given ? /** @type {Point} */ ([given[0], given[1]]) : state.needle.entry };
   return {
-    ...state, needle, frozen: false, replay: null, touched: true, calipers: [], notes: [], drawing: null, tool: "needle",
+    ...state, needle, frozen: false, replay: null, touched: true, calipers: [], notes: [], drawing: null, cursor: null, tool: "needle",
     run: { exercise, examination: state.examination, entryFixed: given !== null, steps: 0 },
   };
 }
