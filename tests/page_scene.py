@@ -54,7 +54,7 @@ def poses(seconds: float = 3.0, rate: float = 120.0) -> np.ndarray:
     """Rows of a session that the needle's limits allow: in, a turn inside the tissue, a rest, a little back."""
     times = np.array([0.0, 0.3, 1.4, 1.8, 2.4, seconds])
     entry = np.array([[8.0, 0.0], [8.0, 0.0], [8.0, 0.0], [8.3, 0.0], [8.3, 0.0], [8.3, 0.0]])
-    tip = np.array([[8.0, 0.0], [8.0, 0.0], [14.0, 9.0], [15.0, 11.0], [15.0, 11.0], [14.5, 10.2]])
+    tip = np.array([[8.0, 0.0], [8.0, 0.0], [14.0, 9.0], [16.0, 10.0], [16.0, 10.0], [15.2, 9.2]])
     path = Insertion(times, entry, tip)
     rows = []
     before = path.pose(0.0)

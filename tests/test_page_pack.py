@@ -10,7 +10,7 @@ import shutil
 import struct
 import subprocess
 import threading
-from http.server import BaseHTTPRequestHandler, HTTPServer
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
@@ -327,7 +327,7 @@ def test_a_page_opens_from_a_file_and_runs_nothing_that_was_added(small, tmp_pat
         def log_message(self, *_):
             pass
 
-    server = HTTPServer(("127.0.0.1", 0), Listener)
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Listener)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     there = f"http://127.0.0.1:{server.server_port}"
     added = (
