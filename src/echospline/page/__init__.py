@@ -9,7 +9,9 @@ if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.page.exercise import Disc, Exercise, check_exercises, default_exercises
     from echospline.page.pack import Pack
     from echospline.page.packing import packed
+    from echospline.page.replay import Verified, pack_of_page, replay, verify
     from echospline.page.scoring import Score, score
+    from echospline.page.sessions_file import RecordedSession, read_sessions
 else:
     on_demand(__name__)
 
@@ -17,10 +19,16 @@ __all__ = [
     "Disc",
     "Exercise",
     "Pack",
+    "RecordedSession",
     "Score",
+    "Verified",
     "bundle",
     "check_exercises",
     "default_exercises",
+    "pack_of_page",
     "packed",
+    "read_sessions",
+    "replay",
     "score",
+    "verify",
 ]

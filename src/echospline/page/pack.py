@@ -321,6 +321,9 @@ def _numbers(tables: Mapping[str, Values]) -> Iterator[tuple[str, float]]:
 def _check_model(pack: Pack, model: ModelPart) -> None:
     D, mesh = pack.dimension, pack.manifest.mesh
     expected = {"dimension": D, "shape": mesh.shape, "spacing": mesh.spacing, "origin": mesh.origin}
+    for name in model.arrays.values():
+        if name not in pack.arrays:
+            raise InputError(f"model {model.name!r} of a pack names array {name!r}, which it does not hold")
     if model.kind == "landmarks":
         for key, wanted in expected.items():
             came = model.options.get(key)

@@ -8,6 +8,7 @@ integral of the squared jerk. Unlike there, the target moves with the *deformed*
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from decimal import ROUND_HALF_UP, Decimal
 from math import inf, isfinite
 
 import numpy as np
@@ -22,6 +23,8 @@ INSIDE = 0.5
 """mm; a needle this deep is in the tissue."""
 TURN, TURN_REST = 3.0, 0.5
 """degrees that make a redirection; and s of a steady direction that end it."""
+LEAST = 0.005
+"""Of any unit; less is printed as 0."""
 JERK_INTERVAL = 0.05
 """s; positions are averaged over this long before the third difference is taken, or it would measure
 the rate of the pointer's events instead of the hand."""
@@ -116,6 +119,41 @@ def score(trace: Trace, exercise: Exercise) -> Score:
         target_shift=float(np.hypot(*(trace.watched[-1, 0] - np.array(exercise.target.centre)))),
         vessel_contacts=sum(touched),
     )
+
+
+def printed(value: float | None) -> str:
+    """Return a metric's value as a page prints it.
+
+    Examples
+    --------
+    >>> [printed(value) for value in (None, 0.004, 3.0, 9.876, 98.76, 9876.5)]
+    ['–', '0', '3', '9.88', '98.8', '9877']
+    """
+    if value is None:
+        return "–"
+    if abs(value) < LEAST:
+        return "0"
+    if value == int(value):
+        return str(int(value))
+    return str(Decimal(value).quantize(Decimal(1).scaleb(-_digits(value)), ROUND_HALF_UP))
+
+
+def prints_alike(a: float | None, b: float | None) -> bool:
+    """Return whether two values of a metric are printed alike.
+
+    So are values whose difference is below a hundredth of the last printed digit: they may lie on both sides of where a printed digit
+    changes, and two builds of the core agree on the field within 1e-4 mm.
+    """
+    if a is None or b is None:
+        return a is b
+    if isinstance(a, bool) or isinstance(b, bool):
+        return a == b
+    return printed(a) == printed(b) or abs(a - b) < 0.01 * 10.0 ** -_digits(a)
+
+
+def _digits(value: float) -> int:
+    """Return the number of decimals that are printed."""
+    return 2 if abs(value) < 10 else 1 if abs(value) < 1000 else 0
 
 
 def swept_area(trace: Trace) -> Floats:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from echospline.menu import on_demand
 
 if TYPE_CHECKING:  # the menu, loaded on demand
-    from echospline.scenario.core_models import landmark_scene, landmark_steps
+    from echospline.scenario.core_models import CoreScene, landmark_scene, landmark_steps
     from echospline.scenario.models import MODELS, build_model
     from echospline.scenario.run import run
     from echospline.scenario.scale import (
@@ -25,6 +25,7 @@ __all__ = [
     "LARGEST_FILE",
     "MODELS",
     "PHANTOM",
+    "CoreScene",
     "DiscSection",
     "ExerciseSection",
     "Scenario",

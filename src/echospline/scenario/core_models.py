@@ -10,6 +10,8 @@ from echospline.scenario.models import build_model
 from echospline.scenario.scenario import Scenario
 from echospline.scene import RegularGrid
 
+__all__ = ["CoreScene", "landmark_scene", "landmark_steps"]
+
 LANDMARKS = ("tps", "elastic")
 """Models of landmarks."""
 
