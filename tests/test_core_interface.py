@@ -27,7 +27,10 @@ import build  # noqa: E402
 HEADER = (CORE / "include" / "echospline" / "echospline.h").read_text(encoding="utf-8")
 PLAIN = re.sub(r"/\*.*?\*/", "", HEADER, flags=re.DOTALL)
 BOTH = PLAIN + re.sub(
-    r"/\*.*?\*/", "", (CORE / "include" / "echospline" / "space.h").read_text(encoding="utf-8"), flags=re.DOTALL
+    r"/\*.*?\*/",
+    "",
+    (CORE / "include" / "echospline" / "space.h").read_text(encoding="utf-8"),
+    flags=re.DOTALL,
 )  # what JavaScript has
 WASM = ROOT / "src" / "echospline" / "_native" / "echospline.wasm"
 JAVASCRIPT = WASM.with_suffix(".js").read_text(encoding="utf-8")

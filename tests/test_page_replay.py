@@ -111,6 +111,46 @@ def test_webassembly_gives_pythons_field_and_picture_over_a_session(small, rows,
     assert np.abs(expected.astype(int) - page_scene.image().pixels).max() > 20
 
 
+def hands(count: int) -> list[list[tuple[list[float], list[float], int]]]:
+    """Ways of a hand that jumps, trembles, turns, rests and leaves, some of them ending on target or vessel."""
+    rng = np.random.default_rng(7)
+    ways = [[([14.5, 0.0], [14.5, 0.0], 20), ([14.5, 0.0], [15.0, 11.0], 200)]]  # straight onto the target
+    for _ in range(count - 1):
+        x = float(rng.uniform(4.0, 12.0))
+        way = [([x, 0.0], [x, 0.0], 20)]
+        for _ in range(rng.integers(2, 6)):
+            tip = [float(rng.uniform(9.0, 26.0)), float(rng.uniform(2.0, 17.0))]
+            way += [([x, 0.0], tip, int(rng.integers(5, 120)))]
+            way += [([x, 0.0], [tip[0] + float(rng.normal(0, 0.2)), tip[1]], 3)] * int(rng.integers(0, 4))
+        if rng.random() < 0.4:
+            way += [([x, 0.0], [x, 0.0], 60)]
+        if rng.random() < 0.6:
+            way += [([x, 0.0], [15.2, 11.2], 90)]
+        ways.append(way)
+    return ways
+
+
+@pytest.mark.skipif(
+    NODE is None, reason="Node is not installed: no session is recorded by the page's own code"
+)
+@pytest.mark.parametrize("kind", MODELS)
+def test_every_metric_of_the_page_is_that_of_the_replay_to_the_printed_digits(small, kind, tmp_path):
+    if not WASM.exists():
+        pytest.skip("echospline.wasm is not built; run make wasm")
+    (tmp_path / "scene.pack").write_bytes(small.to_bytes())
+    done = subprocess.run(
+        [NODE, "tests/node/record_session.mjs", str(tmp_path / "scene.pack"), kind, json.dumps(hands(12))],
+        cwd=page_scene.ROOT, capture_output=True, timeout=120, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr.decode()
+    found = [verify(small, session) for session in parsed_sessions(done.stdout, "page")]
+    assert [one.differences for one in found] == [()] * 12
+    assert len({one.score.redirections for one in found}) > 2
+    assert {one.score.passed for one in found} == {True, False}
+    assert max(one.score.vessel_contacts for one in found) > 1
+    assert max(one.score.target_shift for one in found) > 0.1
+
+
 # --- verification
 
 
