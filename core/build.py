@@ -228,9 +228,10 @@ def sources() -> list[Path]:
 
 
 def functions() -> list[str]:
-    """Names of the C interface's functions, in the header's order."""
-    header = (ROOT / "core" / "include" / "echospline" / "echospline.h").read_text(encoding="utf-8")
-    return re.findall(r"^ECHOSPLINE_API[^;(]*?\b(echospline_\w+)\(", header, flags=re.MULTILINE)
+    """Names of the C interface's functions, in the headers' order."""
+    folder = ROOT / "core" / "include" / "echospline"
+    headers = "".join((folder / name).read_text(encoding="utf-8") for name in ("echospline.h", "space.h"))
+    return re.findall(r"^ECHOSPLINE_API[^;(]*?\b(echospline_\w+)\(", headers, flags=re.MULTILINE)
 
 
 @functools.cache

@@ -26,6 +26,12 @@ import build  # noqa: E402
 
 HEADER = (CORE / "include" / "echospline" / "echospline.h").read_text(encoding="utf-8")
 PLAIN = re.sub(r"/\*.*?\*/", "", HEADER, flags=re.DOTALL)
+BOTH = PLAIN + re.sub(
+    r"/\*.*?\*/",
+    "",
+    (CORE / "include" / "echospline" / "space.h").read_text(encoding="utf-8"),
+    flags=re.DOTALL,
+)  # what JavaScript has
 WASM = ROOT / "src" / "echospline" / "_native" / "echospline.wasm"
 JAVASCRIPT = WASM.with_suffix(".js").read_text(encoding="utf-8")
 CC = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
@@ -38,20 +44,20 @@ needs_elf = pytest.mark.skipif(
 )
 
 
-def declared() -> dict[str, int]:
+def declared(text: str = PLAIN) -> dict[str, int]:
     """Functions of the header with their number of arguments."""
-    found = re.findall(r"ECHOSPLINE_API\s+[\w\s*]*?\b(echospline_\w+)\(([^)]*)\)", PLAIN)
+    found = re.findall(r"ECHOSPLINE_API\s+[\w\s*]*?\b(echospline_\w+)\(([^)]*)\)", text)
     return {name: 0 if arguments.strip() == "void" else arguments.count(",") + 1 for name, arguments in found}
 
 
-def header_enums() -> dict[str, int]:
-    return {name: int(value) for name, value in re.findall(r"\bECHOSPLINE_([A-Z0-9_]+) = (\d+)", PLAIN)}
+def header_enums(text: str = PLAIN) -> dict[str, int]:
+    return {name: int(value) for name, value in re.findall(r"\bECHOSPLINE_([A-Z0-9_]+) = (\d+)", text)}
 
 
-def header_structs() -> dict[str, list[str]]:
+def header_structs(text: str = PLAIN) -> dict[str, list[str]]:
     """Structs of the header with the names of their members."""
     structs = {}
-    for name, body in re.findall(r"typedef struct (echospline_\w+) \{(.*?)\} \1;", PLAIN, flags=re.DOTALL):
+    for name, body in re.findall(r"typedef struct (echospline_\w+) \{(.*?)\} \1;", text, flags=re.DOTALL):
         members = re.sub(r"\[\d+\]", "", body)
         lines = [line.strip() for line in members.split(";") if line.strip()]
         structs[name] = [
@@ -210,15 +216,15 @@ def test_webassembly_is_small_and_needs_nothing():
     build.check_wasm(WASM)
     assert len(zlib.compress(WASM.read_bytes(), 9)) < 200_000  # as a page packs it, both precisions included
     names = set(re.findall(rb"echospline_\w+", WASM.read_bytes()))
-    assert {name.encode() for name in declared()} <= names
+    assert {name.encode() for name in declared(BOTH)} <= names
 
 
 def test_javascript_calls_functions_of_the_header_alone():
-    names = set(re.findall(r"\b(echospline_\w+)\(", JAVASCRIPT)) - set(header_structs())
-    assert names <= set(declared())
+    names = set(re.findall(r"\b(echospline_\w+)\(", JAVASCRIPT)) - set(header_structs(BOTH))
+    assert names <= set(declared(BOTH))
     called_by_name = {
         f"echospline_{what}_{verb}"
-        for what in ("scene", "tissue", "picture", "forced")
+        for what in ("scene", "tissue", "picture", "forced", "volume")
         for verb in ("create", "message")
     }
     called_by_name |= {"echospline_scene_destroy", "echospline_tissue_destroy"}
@@ -227,19 +233,19 @@ def test_javascript_calls_functions_of_the_header_alone():
         "echospline_picture_deform",
         "echospline_picture_deform_single",
     }
-    assert set(declared()) - names - called_by_name - not_needed == set()
+    assert set(declared(BOTH)) - names - called_by_name - not_needed == set()
 
 
 @pytest.mark.skipif(NODE is None or build.zig() is None, reason="Node or ziglang is not installed")
 def test_javascripts_structs_are_laid_out_as_the_compiler_lays_them_out(tmp_path):
     numbers = [
         f"sizeof({name})" if member is None else f"offsetof({name}, {member})"
-        for name, members in header_structs().items()
+        for name, members in header_structs(BOTH).items()
         for member in (None, *members)
     ]
     source, module, layouts = tmp_path / "layout.c", tmp_path / "layout.wasm", tmp_path / "layouts.json"
     source.write_text(
-        '#include "echospline/echospline.h"\n#include <stddef.h>\n'
+        '#include "echospline/space.h"\n#include <stddef.h>\n'
         f"const int numbers[] = {{{', '.join(numbers)}}};\nint number(int i) {{ return numbers[i]; }}\n"
     )
     command = [
@@ -264,7 +270,7 @@ def test_javascripts_structs_are_laid_out_as_the_compiler_lays_them_out(tmp_path
     values = iter(json.loads(run.stdout))
     result = {
         name: {"size": next(values), "offsets": {member: next(values) for member in members}}
-        for name, members in header_structs().items()
+        for name, members in header_structs(BOTH).items()
     }
     layouts.write_text(json.dumps(result))
     done = subprocess.run(
@@ -281,4 +287,4 @@ def test_javascripts_structs_are_laid_out_as_the_compiler_lays_them_out(tmp_path
 def test_javascript_has_every_enum_value_of_the_header():
     blocks = re.findall(r"Object\.freeze\(\{([^{}\[\]]*)\}\)", JAVASCRIPT)
     values = {name: int(value) for block in blocks for name, value in re.findall(r"(\w+): (\d+)", block)}
-    assert values == header_enums()
+    assert values == header_enums(BOTH)

@@ -5,9 +5,10 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from echospline.errors import InputError
+from echospline.mechanics.space_response import SpaceResponse, block
 from echospline.picture import NeedleEcho
 from echospline.picture.slices import NativeVolume, SliceDrawing, gradients, origins
-from echospline.scene import Probe, SpatialPose, Volume, probe_plane
+from echospline.scene import Probe, SpatialPose, Tissue, Volume, probe_plane
 
 RNG = np.random.default_rng(4)
 SHAPES = [(8, 8, 8), (17, 9, 30), (33, 41, 12), (5, 3, 2), (1, 7, 9)]
@@ -239,3 +240,26 @@ def test_planes_turn_as_hands_do():
     plane = probe_plane((3.0, 1.0, -2.0), 40.0, 20.0, -10.0)
     p = RNG.normal(size=(10, 3))
     np.testing.assert_allclose(plane.lower(plane.lift(p[:, :2]))[:, :2], p[:, :2], atol=1e-12)
+
+
+def test_the_core_traces_a_plane_back_as_numpy_does():
+    """The same lattice, residual and folds from both, where tissue is moved a little and where it folds."""
+    volume, probe = smooth_volume(), Probe(width=30, depth=30, pixel=0.15, elevation=0.0)
+    drawing = SliceDrawing(volume, probe)
+    plane = probe_plane((0.0, 0.0, 1.0), 25.0, 10.0)
+    grid, clamps = block((36.0, 36.0, 36.0), {"bottom": "clamped", "left": "clamped", "right": "clamped"})
+    response = SpaceResponse(grid, clamps, Tissue(10.0, 0.45), radius=0.7)
+    places = np.array([[-6.0, 4.0, 0.0], [-3.0, 8.0, 0.5], [0.0, 12.0, 1.0]])
+    pose = SpatialPose((-9.0, 0.0, -0.5), (0.0, 12.0, 1.0))
+    for force, folded in ((0.05, False), (0.4, True)):
+        field = response.field(places, force * np.array([[0.2, 0.3, 0.0], [0.2, 0.3, 0.1], [0.6, 0.8, 0.1]]))
+        ours = drawing.draw(plane, field, pose)
+        theirs = drawing.draw(plane, lambda p, f=field: f(p), pose)  # a callable that the core does not know
+        assert (ours.folds is not None) == (theirs.folds is not None) == folded
+        if not folded:
+            np.testing.assert_allclose(ours.lattice, theirs.lattice, atol=2e-5)
+            assert ours.residual == pytest.approx(theirs.residual, abs=1e-3)
+            assert np.abs(ours.image.pixels.astype(int) - theirs.image.pixels).max() <= 1
+        else:
+            assert ours.folds.worst == pytest.approx(theirs.folds.worst, abs=1e-3)
+            np.testing.assert_allclose(ours.folds.place, theirs.folds.place, atol=1e-3)

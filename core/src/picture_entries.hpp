@@ -19,6 +19,7 @@ struct PictureEntries {
   void (*check)(void* picture, echospline_picture_report& report);
   void (*echo)(void* picture, const echospline_needle& needle, const double* points, int64_t count, double* power,
                double* transmission);
+  void (*shade)(const echospline_look& look, const uint8_t* grey, int columns, int rows, uint8_t* rgba);
 };
 
 }  // namespace echospline

@@ -3,6 +3,7 @@
 #include <new>
 
 #include "../include/echospline/picture.hpp"
+#include "../include/echospline/shading.hpp"
 #include "picture_entries.hpp"
 
 namespace echospline::ECHOSPLINE_CORE {
@@ -37,6 +38,7 @@ const PictureEntries picture_entries = {
     [](void* picture, echospline_picture_report& report) { picture_of(picture).check(report); },
     [](void* picture, const echospline_needle& needle, const double* points, int64_t count, double* power,
        double* transmission) { picture_of(picture).echo_at(needle, points, count, power, transmission); },
+    shade,
 };
 
 }  // namespace

@@ -88,6 +88,59 @@ echospline_status check_slice(const echospline_slice& s, const double* lattice, 
   return ECHOSPLINE_OK;
 }
 
+/// What a field of forces must be, without its level.
+echospline_status check_field(const echospline_force_field& f) {
+  if (f.struct_size != sizeof f || f.force_count < 0 || f.force_count > MOST_FORCES) return ECHOSPLINE_WRONG_SIZE;
+  if (f.force_count && (!f.places || !f.forces || !f.radii)) return ECHOSPLINE_NULL_POINTER;
+  if (f.top < ECHOSPLINE_TOP_NONE || f.top > ECHOSPLINE_TOP_SLIDING) return ECHOSPLINE_WRONG_VALUE;
+  if (!(f.poisson > -1.0 && f.poisson < 0.5) || !(f.shear_modulus > 0 && f.shear_modulus <= LARGEST_FORCE))
+    return ECHOSPLINE_WRONG_VALUE;
+  for (int64_t k = 0; k < 3 * f.force_count; ++k)
+    if (!near_enough(f.places[k]) || !(std::fabs(f.forces[k]) <= LARGEST_FORCE)) return ECHOSPLINE_WRONG_VALUE;
+  for (int64_t j = 0; j < f.force_count; ++j) {
+    const double radius = f.radii[j], depth = f.places[3 * j + 1];
+    if (!(radius > 0 && radius <= FURTHEST)) return ECHOSPLINE_WRONG_VALUE;
+    if (f.top != ECHOSPLINE_TOP_NONE && !(depth > 0)) return ECHOSPLINE_WRONG_VALUE;
+  }
+  if (!f.lattice) return ECHOSPLINE_OK;
+  int64_t numbers = 3;
+  for (int k = 0; k < 3; ++k) {
+    if (f.lattice_shape[k] < 4 || f.lattice_shape[k] > MOST_ALONG) return ECHOSPLINE_WRONG_SIZE;
+    if (!(f.lattice_spacing[k] >= 1e-4 && f.lattice_spacing[k] <= FURTHEST) || !near_enough(f.lattice_origin[k]))
+      return ECHOSPLINE_WRONG_VALUE;
+    numbers *= f.lattice_shape[k];
+  }
+  if (numbers > MOST_VOXELS) return ECHOSPLINE_WRONG_SIZE;
+  for (int64_t k = 0; k < numbers; ++k)
+    if (!near_enough(f.lattice[k])) return ECHOSPLINE_WRONG_VALUE;
+  return ECHOSPLINE_OK;
+}
+
+echospline_status check_trace(echospline_volume* volume, const echospline_slice& slice, const double* places,
+                              int64_t count, const double* tip, double close, const echospline_trace_report& report) {
+  if (!volume->volume) return ECHOSPLINE_FAILED_HANDLE;
+  if (report.struct_size != sizeof report)
+    return refuse(volume->message, ECHOSPLINE_WRONG_SIZE, "struct_size of the report must be %zu; got %u",
+                  sizeof report, report.struct_size);
+  if (const echospline_status status =
+          check_slice(slice, places, count, int64_t(slice.columns) * slice.rows, volume->message))
+    return status;
+  for (int k = 0; tip && k < 3; ++k)
+    if (!near_enough(tip[k]))
+      return refuse(volume->message, ECHOSPLINE_WRONG_VALUE, "tip must be three numbers in mm; got (%g, %g, %g)",
+                    tip[0], tip[1], tip[2]);
+  if (!(close >= 1e-7 && close <= FURTHEST))
+    return refuse(volume->message, ECHOSPLINE_WRONG_VALUE, "close must be a length in mm, 1e-7 or more; got %g", close);
+  return ECHOSPLINE_OK;
+}
+
+echospline_status traced(echospline_volume* volume, echospline_status status) {
+  if (status == ECHOSPLINE_OUT_OF_MEMORY)
+    return refuse(volume->message, status, "memory for tracing the lattice ran out");
+  return status == ECHOSPLINE_OK ? status
+                                 : refuse(volume->message, status, "the tissue's displacement could not be computed");
+}
+
 }  // namespace
 
 extern "C" {
@@ -140,38 +193,41 @@ echospline_status echospline_volume_slice(echospline_volume* volume, const echos
 echospline_status echospline_force_field_at(const echospline_force_field* field, const double* points, int64_t count,
                                             double* displacement) {
   if (!field || !points || !displacement) return ECHOSPLINE_NULL_POINTER;
-  if (field->struct_size != sizeof *field || count < 0 || field->force_count < 0 || field->force_count > MOST_FORCES)
-    return ECHOSPLINE_WRONG_SIZE;
-  if (field->force_count && (!field->places || !field->forces || !field->radii)) return ECHOSPLINE_NULL_POINTER;
+  if (count < 0) return ECHOSPLINE_WRONG_SIZE;
+  if (const echospline_status status = check_field(*field)) return status;
   const echospline::Level* level = echospline::find_level(field->level);
-  if (!level || field->top < ECHOSPLINE_TOP_NONE || field->top > ECHOSPLINE_TOP_SLIDING) return ECHOSPLINE_WRONG_VALUE;
-  if (!(field->poisson > -1.0 && field->poisson < 0.5) ||
-      !(field->shear_modulus > 0 && field->shear_modulus <= LARGEST_FORCE))
-    return ECHOSPLINE_WRONG_VALUE;
-  for (int64_t k = 0; k < 3 * field->force_count; ++k)
-    if (!near_enough(field->places[k]) || !(std::fabs(field->forces[k]) <= LARGEST_FORCE))
-      return ECHOSPLINE_WRONG_VALUE;
-  for (int64_t j = 0; j < field->force_count; ++j) {
-    const double radius = field->radii[j], depth = field->places[3 * j + 1];
-    if (!(radius > 0 && radius <= FURTHEST)) return ECHOSPLINE_WRONG_VALUE;
-    if (field->top != ECHOSPLINE_TOP_NONE && !(depth > 0)) return ECHOSPLINE_WRONG_VALUE;
-  }
+  if (!level) return ECHOSPLINE_WRONG_VALUE;
   for (int64_t k = 0; k < 3 * count; ++k)
     if (!near_enough(points[k])) return ECHOSPLINE_WRONG_VALUE;
-  if (field->lattice) {
-    int64_t numbers = 3;
-    for (int k = 0; k < 3; ++k) {
-      if (field->lattice_shape[k] < 4 || field->lattice_shape[k] > MOST_ALONG) return ECHOSPLINE_WRONG_SIZE;
-      if (!(field->lattice_spacing[k] >= 1e-4 && field->lattice_spacing[k] <= FURTHEST) ||
-          !near_enough(field->lattice_origin[k]))
-        return ECHOSPLINE_WRONG_VALUE;
-      numbers *= field->lattice_shape[k];
-    }
-    if (numbers > MOST_VOXELS) return ECHOSPLINE_WRONG_SIZE;
-    for (int64_t k = 0; k < numbers; ++k)
-      if (!near_enough(field->lattice[k])) return ECHOSPLINE_WRONG_VALUE;
-  }
   return level->space->force_field(*field, points, count, displacement) ? ECHOSPLINE_OK : ECHOSPLINE_OUT_OF_MEMORY;
+}
+
+echospline_status echospline_volume_trace(echospline_volume* volume, const echospline_slice* slice,
+                                          const echospline_force_field* field, const double* places, int64_t count,
+                                          const double* tip, double close, double* lattice,
+                                          echospline_trace_report* report) {
+  if (!volume || !slice || !field || !places || !lattice || !report) return ECHOSPLINE_NULL_POINTER;
+  if (const echospline_status status = check_trace(volume, *slice, places, count, tip, close, *report)) return status;
+  if (const echospline_status status = check_field(*field))
+    return refuse(volume->message, status,
+                  "the field must hold finite numbers below 1e6 mm, positive radii and forces below the surface");
+  return traced(volume, volume->level->space->trace(volume->volume, *slice, field, nullptr, places, tip, close, lattice,
+                                                    *report));
+}
+
+echospline_status echospline_volume_trace_tissue(echospline_volume* volume, const echospline_slice* slice,
+                                                 echospline_tissue* tissue, const double* places, int64_t count,
+                                                 const double* tip, double close, double* lattice,
+                                                 echospline_trace_report* report) {
+  if (!volume || !slice || !places || !lattice || !report) return ECHOSPLINE_NULL_POINTER;
+  if (const echospline_status status = check_trace(volume, *slice, places, count, tip, close, *report)) return status;
+  echospline::TissueView view;
+  if (const echospline_status status = echospline::view_of(tissue, view, volume->message)) return status;
+  if (view.counts->dimension != 3)
+    return refuse(volume->message, ECHOSPLINE_WRONG_VALUE, "the tissue must be one in space; got dimension %d",
+                  view.counts->dimension);
+  return traced(volume, volume->level->space->trace(volume->volume, *slice, nullptr, &view, places, tip, close, lattice,
+                                                    *report));
 }
 
 }  // extern "C"

@@ -2,6 +2,7 @@
 #pragma once
 #include "../include/echospline/space.h"
 #include "level.hpp"
+#include "tissue_entries.hpp"
 
 namespace echospline {
 
@@ -12,6 +13,10 @@ struct SpaceEntries {
   int64_t (*slice)(const void* volume, const echospline_slice& slice, const double* lattice, uint8_t* out);
   bool (*force_field)(const echospline_force_field& field, const double* points, int64_t count,
                       double* displacement);  // false when memory runs out
+  /// Trace a slice's lattice back through a field, or a tissue where field is nullptr.
+  echospline_status (*trace)(const void* volume, const echospline_slice& slice, const echospline_force_field* field,
+                             const TissueView* tissue, const double* places, const double* tip, double close,
+                             double* lattice, echospline_trace_report& report);
 };
 
 }  // namespace echospline

@@ -188,6 +188,18 @@ OFFSET(echospline_picture_report, folded_cells, 32);
 OFFSET(echospline_picture_report, smallest_jacobian, 40);
 OFFSET(echospline_picture_report, place, 48);
 
+SIZE(echospline_look, 112);
+OFFSET(echospline_look, struct_size, 0);
+OFFSET(echospline_look, level, 4);
+OFFSET(echospline_look, invert, 8);
+OFFSET(echospline_look, flip, 12);
+OFFSET(echospline_look, gain, 16);
+OFFSET(echospline_look, recorded_range, 24);
+OFFSET(echospline_look, dynamic_range, 32);
+OFFSET(echospline_look, depth_gain_count, 40);
+OFFSET(echospline_look, reserved, 44);
+OFFSET(echospline_look, depth_gains, 48);
+
 SIZE(echospline_forced_options, 120);
 OFFSET(echospline_forced_options, struct_size, 0);
 OFFSET(echospline_forced_options, level, 4);

@@ -143,6 +143,29 @@ test("a picture follows a tissue of its mesh", { skip }, () => {
   for (const thing of [other, picture, tissue, scene]) thing.destroy();
 });
 
+test("a picture is shaded for a display", { skip }, () => {
+  const pixels = Uint8Array.from({ length: 30 * 20 }, (_, i) => (7 * i) % 256);
+  const options = { columns: 30, rows: 20, spacing: [1, 1], mesh_shape: [4, 3], mesh_spacing: [10, 10] };
+  const picture = core.picture(options, pixels);
+  const grey = Uint8Array.from(picture.draw(null));
+  const plain = picture.shade({});
+  assert.ok(plain instanceof Uint8ClampedArray);
+  assert.ok(plain.every((value, i) => value === (i % 4 === 3 ? 255 : grey[i >> 2])));
+  // 6 dB of 60 at the first row falling to none at the last, over 40 dB: 255 (1 + (60 (g/255 - 1) + gain) / 40)
+  const shown = picture.shade({ depth_gains: [6, 0], dynamic_range: 40, flip: 1, invert: 1 });
+  for (let i = 0; i < grey.length; ++i) {
+    const [row, column] = [Math.floor(i / 30), i % 30];
+    const level = 60 * (grey[i] / 255 - 1) + 6 * (1 - row / 19);
+    const expected = 255 - Math.min(Math.max(255 * (1 + level / 40), 0), 255);
+    assert.ok(Math.abs(shown[4 * (row * 30 + 29 - column)] - expected) <= 0.55 || grey[i] < 8);
+  }
+  assert.throws(() => picture.shade({ gain: NaN }), (error) => error instanceof CoreError && error.status === Status.WRONG_VALUE);
+  picture.destroy();
+  const coloured = core.picture({ ...options, channels: 3 }, new Uint8Array(3 * 600));
+  assert.throws(() => coloured.shade({}), /expected a picture of grey/);
+  coloured.destroy();
+});
+
 test("structs are laid out as the compiler lays them out", { skip: process.env.ECHOSPLINE_WASM_LAYOUTS ? false : "no layouts given" }, () => {
   const given = JSON.parse(readFileSync(process.env.ECHOSPLINE_WASM_LAYOUTS, "utf8"));
   const ours = Object.fromEntries(Object.entries(LAYOUTS).map(([name, { size, fields }]) => [

@@ -397,6 +397,36 @@ namespace Echospline
         }
     }
 
+    /// <summary>echospline_look: how a grey picture is shown; begin with Look.Defaults(). Look.Shade makes its RGBA.</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct Look
+    {
+        public uint StructSize;
+        public Level Level;
+        public int Invert, Flip;
+        public double Gain, RecordedRange, DynamicRange;  // dB
+        public int DepthGainCount;
+        public int Reserved;
+        [MarshalAs(UnmanagedType.ByValArray, SizeConst = 8)] public double[] DepthGains;  // dB
+
+        /// <summary>The core's own defaults: a picture of 60 dB as it is.</summary>
+        public static Look Defaults()
+        {
+            var look = new Look { StructSize = (uint)Marshal.SizeOf(typeof(Look)), DepthGains = new double[8] };
+            Native.echospline_look_defaults(ref look);
+            return look;
+        }
+
+        /// <summary>Shade grey pixels (rows, columns) into red, green, blue and alpha.</summary>
+        public void Shade(byte[] grey, int columns, int rows, byte[] rgba)
+        {
+            if (grey.LongLength != (long)columns * rows)
+                throw new ArgumentException("expected " + (long)columns * rows + " grey pixels; got " + grey.LongLength);
+            var status = Native.echospline_shade(ref this, grey, columns, rows, rgba, rgba.LongLength);
+            if (status != Status.Ok) throw new EchosplineException(status, Native.Text(Native.echospline_status_text(status)));
+        }
+    }
+
     /// <summary>echospline_forced_options; begin with ForcedOptions.Defaults().</summary>
     [StructLayout(LayoutKind.Sequential)]
     public struct ForcedOptions
@@ -719,6 +749,8 @@ namespace Echospline
         [DllImport(Library)] internal static extern Status echospline_picture_inverse(IntPtr picture, [Out] float[] x, [Out] float[] y, long count);
         [DllImport(Library)] internal static extern Status echospline_picture_check(IntPtr picture, ref PictureReport report);
         [DllImport(Library)] internal static extern Status echospline_picture_echo(IntPtr picture, ref Needle needle, double[] points, long point_count, [Out] double[] power, [Out] double[] transmission);
+        [DllImport(Library)] internal static extern void echospline_look_defaults(ref Look look);
+        [DllImport(Library)] internal static extern Status echospline_shade(ref Look look, byte[] grey, int columns, int rows, [Out] byte[] rgba, long bytes);
         [DllImport(Library)] internal static extern void echospline_forced_defaults(ref ForcedOptions options);
         [DllImport(Library)] internal static extern Status echospline_forced_create(ref ForcedOptions options, out IntPtr forced);
         [DllImport(Library)] internal static extern void echospline_forced_destroy(IntPtr forced);

@@ -363,6 +363,30 @@ ECHOSPLINE_API echospline_status echospline_picture_echo(echospline_picture* pic
                                                          const double* points, int64_t point_count, double* power,
                                                          double* transmission);
 
+/* ---- A picture on a display --------------------------------------------------------------------------------------- */
+
+/* How a recorded 8-bit picture is shown. It is compressed logarithmically: grey 255 is white, grey 0 lies recorded_range below. Where
+ * nothing was recorded, grey 0, stays black under any gain; below grey 8 the rise from there is linear. */
+typedef struct echospline_look {
+  uint32_t struct_size;
+  int32_t level;
+  int32_t invert;           /* 1: white becomes black */
+  int32_t flip;             /* 1: left and right are exchanged */
+  double gain;              /* dB, -100 to 100 */
+  double recorded_range;    /* of the recorded picture, 1 to 300 dB */
+  double dynamic_range;     /* from black to white on the display, 1 to 300 dB */
+  int32_t depth_gain_count; /* sliders, 0 to 8 */
+  int32_t reserved;
+  double
+      depth_gains[8]; /* dB, -100 to 100 each, at even distances from the first row to the last, linear between them */
+} echospline_look;
+
+/* Fill a look that shows a picture of 60 dB as it is. Does nothing when look is NULL or its struct_size is not set. */
+ECHOSPLINE_API void echospline_look_defaults(echospline_look* look);
+/* Shade a grey picture (rows, columns) into red, green, blue and alpha (255) of each pixel; bytes: room for them, 4 * columns * rows. */
+ECHOSPLINE_API echospline_status echospline_shade(const echospline_look* look, const uint8_t* grey, int32_t columns,
+                                                  int32_t rows, uint8_t* rgba, int64_t bytes);
+
 /* ---- Tissue under a needle's forces ------------------------------------------------------------------------------- */
 
 /* A *forced tissue* is elastic tissue in the plane under a needle that sticks, slips and cuts. The core solves the needle's forces and

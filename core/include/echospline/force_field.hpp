@@ -82,36 +82,62 @@ struct SmoothLattice {
       weights[k][2] = ((-1.5 * t + 2.0) * t + 0.5) * t;
       weights[k][3] = (0.5 * t - 0.5) * t * t;
     }
+    Doubles4 sum[3] = {};  // twelve numbers of a row: four points along x, three components each
     for (int z = 0; z < 4; ++z)
       for (int y = 0; y < 4; ++y) {
         const double across = weights[2][z] * weights[1][y];
         const double* row = values + 3 * ((int64_t(first[2] + z) * shape[1] + first[1] + y) * shape[0] + first[0]);
-        for (int x = 0; x < 4; ++x) {
-          const double w = across * weights[0][x];
-          for (int k = 0; k < 3; ++k) u[k] += w * row[3 * x + k];
+        for (int k = 0; k < 3; ++k) {
+          Doubles4 four;
+          std::memcpy(&four, row + 4 * k, sizeof four);
+          sum[k] += across * four;
         }
       }
+    for (int k = 0; k < 12; ++k) u[k % 3] += weights[0][k / 3] * sum[k / 4][k % 4];
   }
 };
 
-/// Displacement (count, 3) at points (count, 3), mm.
-template <Top TOP>
-inline void force_field(const PointForce* forces, int64_t force_count, float nu, const double* points, int64_t count,
-                        double* out) {
-  for (int64_t first = 0; first < count; first += LANES) {
-    const int here = static_cast<int>(smaller<int64_t>(LANES, count - first));
-    Floats p[3];
-    for (int i = 0; i < LANES; ++i) {
-      const double* point = points + 3 * (first + smaller(i, here - 1));
-      for (int k = 0; k < 3; ++k) p[k][i] = static_cast<float>(point[k]);
-    }
-    Sum3 u;
-    add_forces<TOP>(forces, force_count, nu, p[0], p[1], p[2], u);
-    for (int i = 0; i < here; ++i) {
-      double* to = out + 3 * (first + i);
-      to[0] = u.x[i], to[1] = u.y[i], to[2] = u.z[i];
+/// Displacement of tissue by point forces and a smooth remainder, at any points; above a surface it goes on as it is there.
+struct SpaceField {
+  const PointForce* forces = nullptr;
+  int64_t count = 0;
+  float poisson = 0;
+  Top top = Top::none;
+  const SmoothLattice* smooth = nullptr;
+
+  /// Displacement (n, 3) at points (n, 3), mm.
+  void operator()(const double* points, int64_t n, double* out) const {
+    if (top == Top::free)
+      sum<Top::free>(points, n, out);
+    else if (top == Top::sliding)
+      sum<Top::sliding>(points, n, out);
+    else
+      sum<Top::none>(points, n, out);
+  }
+
+ private:
+  template <Top TOP>
+  void sum(const double* points, int64_t n, double* out) const {
+    for (int64_t first = 0; first < n; first += LANES) {
+      const int here = static_cast<int>(smaller<int64_t>(LANES, n - first));
+      double below[3 * LANES];
+      Floats p[3];
+      for (int i = 0; i < LANES; ++i) {
+        const double* point = points + 3 * (first + smaller(i, here - 1));
+        for (int k = 0; k < 3; ++k) {
+          const double at = k == 1 && TOP != Top::none ? larger(point[k], 0.0) : point[k];
+          below[3 * i + k] = at, p[k][i] = static_cast<float>(at);
+        }
+      }
+      Sum3 u;
+      add_forces<TOP>(forces, count, poisson, p[0], p[1], p[2], u);
+      for (int i = 0; i < here; ++i) {
+        double* to = out + 3 * (first + i);
+        to[0] = u.x[i], to[1] = u.y[i], to[2] = u.z[i];
+        if (smooth) smooth->add(below + 3 * i, to);
+      }
     }
   }
-}
+};
 
 }  // namespace echospline::ECHOSPLINE_CORE

@@ -1,7 +1,7 @@
 /*
  * space.h: volumes, slices through them and fields of point forces in space; the C interface of the core for scenes in space.
  *
- * Conventions and errors are those of echospline.h. The faces for JavaScript and C# do not have these functions yet.
+ * Conventions and errors are those of echospline.h. The face for C# does not have these functions yet.
  */
 #ifndef ECHOSPLINE_SPACE_H
 #define ECHOSPLINE_SPACE_H
@@ -74,9 +74,34 @@ typedef struct echospline_force_field {
   const double* lattice;     /* (nz, ny, nx, 3) displacement, mm, or NULL */
 } echospline_force_field;
 
-/* Displacement (count, 3) mm at points (count, 3) mm, in single precision, on or below the surface. */
+/* Displacement (count, 3) mm at points (count, 3) mm, in single precision; above a surface it goes on as it is there. */
 ECHOSPLINE_API echospline_status echospline_force_field_at(const echospline_force_field* field, const double* points,
                                                            int64_t count, double* displacement);
+
+/* How well a lattice was traced back. */
+typedef struct echospline_trace_report {
+  uint32_t struct_size;
+  int32_t reserved;
+  double
+      residual; /* largest distance midway between the lattice's places from the forward map of the origin there, mm */
+  int64_t folded;  /* places at which tissue is turned inside out, or to which none leads */
+  double jacobian; /* smallest determinant of I + grad u at those, or infinite where there are none */
+  double place[3]; /* where that is, in the undeformed tissue, mm */
+} echospline_trace_report;
+
+/* Find where the places of a slice's lattice come from: X + u(X) = p. `lattice` is what echospline_volume_slice draws from.
+ * places, lattice (count numbers): as those of echospline_volume_slice. close: distance within which a place has to be reached, mm.
+ * tip: the needle's, (3) mm, around which folds are looked for; NULL: only where Newton's method was needed. */
+ECHOSPLINE_API echospline_status echospline_volume_trace(echospline_volume* volume, const echospline_slice* slice,
+                                                         const echospline_force_field* field, const double* places,
+                                                         int64_t count, const double* tip, double close,
+                                                         double* lattice, echospline_trace_report* report);
+/* The same for a tissue in space of echospline.h. */
+ECHOSPLINE_API echospline_status echospline_volume_trace_tissue(echospline_volume* volume,
+                                                                const echospline_slice* slice,
+                                                                echospline_tissue* tissue, const double* places,
+                                                                int64_t count, const double* tip, double close,
+                                                                double* lattice, echospline_trace_report* report);
 
 #ifdef __cplusplus
 }

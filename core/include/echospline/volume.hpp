@@ -34,6 +34,15 @@ class Volume {
     return true;
   }
 
+  /// Whether a point lies between the outermost voxels' centres.
+  bool contains(const double* point) const {
+    for (int k = 0; k < 3; ++k) {
+      const double index = (point[k] - origin_[k]) * scale_[k];
+      if (!(index >= -1e-9 && index <= shape_[k] - 1 + 1e-9)) return false;
+    }
+    return true;
+  }
+
   /// Draw a bent slice. Returns the number of shown pixels whose place lies outside the volume; -1 when memory runs out.
   int64_t slice(const echospline_slice& s, const double* lattice, uint8_t* out) const {
     const int across = (s.columns - 1 + s.step - 1) / s.step + 1, lines = (s.rows - 1 + s.step - 1) / s.step + 1;

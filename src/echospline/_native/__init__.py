@@ -296,6 +296,23 @@ class PictureReport(ctypes.Structure):
     ]
 
 
+class Look(ctypes.Structure):
+    """echospline_look."""
+
+    _fields_ = [
+        ("struct_size", c_uint32),
+        ("level", c_int32),
+        ("invert", c_int32),
+        ("flip", c_int32),
+        ("gain", c_double),
+        ("recorded_range", c_double),
+        ("dynamic_range", c_double),
+        ("depth_gain_count", c_int32),
+        ("reserved", c_int32),
+        ("depth_gains", c_double * 8),
+    ]
+
+
 class ForcedOptions(ctypes.Structure):
     """echospline_forced_options."""
 
@@ -388,6 +405,8 @@ FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {  # name: result, arguments; hand
     "echospline_picture_inverse": (c_int32, [c_void_p, c_void_p, c_void_p, c_int64]),
     "echospline_picture_check": (c_int32, [c_void_p, POINTER(PictureReport)]),
     "echospline_picture_echo": (c_int32, [c_void_p, POINTER(Needle), c_void_p, c_int64, c_void_p, c_void_p]),
+    "echospline_look_defaults": (None, [POINTER(Look)]),
+    "echospline_shade": (c_int32, [POINTER(Look), c_void_p, c_int32, c_int32, c_void_p, c_int64]),
     "echospline_forced_defaults": (None, [POINTER(ForcedOptions)]),
     "echospline_forced_create": (c_int32, [POINTER(ForcedOptions), POINTER(c_void_p)]),
     "echospline_forced_destroy": (None, [c_void_p]),

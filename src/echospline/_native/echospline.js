@@ -1,5 +1,7 @@
 // The core in WebAssembly: scenes, tissues, pictures and the motion of a needle, over the C interface and nothing else.
 //
+// Scenes in space: `core.volume`, `core.forceField` and `core.plane`, over space.h.
+//
 // `load(bytes)` makes a Core from the bytes of echospline.wasm, in a page, a worker or node. Structs and enums have the names of
 // core/include/echospline/echospline.h; there are no defaults here. Handles live in the module's memory: `destroy` them, tissues first.
 // Typed arrays that a method returns are views of that memory, right until the next call into the core: copy what is to be kept.
@@ -26,6 +28,8 @@ export const Border = Object.freeze({ BORDER_VALUE: 0, BORDER_TRANSPARENT: 1 });
 export const Method = Object.freeze({ METHOD_AUTO: 0, METHOD_EXACT: 1, METHOD_PULL: 2 });
 export const NeedlePart = Object.freeze({ SHAFT: 1, BEVEL: 2, TAIL: 4, SHADOW: 8 });
 export const LandmarkKind = Object.freeze({ CONTACT: 0, LEAVING: 1, TIP: 2, TIP_LEFT: 3 });
+
+export const Top = Object.freeze({ TOP_NONE: 0, TOP_FREE: 1, TOP_SLIDING: 2 });
 
 /** @typedef {"i32" | "u32" | "i64" | "f64" | "pointer"} Kind */
 /** @typedef {{ name: string, kind: Kind, count: number, offset: number }} Field */
@@ -56,6 +60,13 @@ export const LandmarkKind = Object.freeze({ CONTACT: 0, LEAVING: 1, TIP: 2, TIP_
  *   method: number, residual: number, difference: number, exact_share: number, folded_cells: number,
  *   smallest_jacobian: number, place: number[]
  * }} PictureReport
+ */
+/**
+ * How a picture is shown, named as in echospline_look; `depth_gains` has as many numbers as there are sliders.
+ * @typedef {{
+ *   level?: number, invert?: number, flip?: number, gain?: number, recorded_range?: number, dynamic_range?: number,
+ *   depth_gains?: Numbers
+ * }} Look
  */
 /** @typedef {Uint8Array | Uint16Array | Int16Array | Float32Array} Pixels */
 /** @typedef {{ entry: Numbers, tip: Numbers, speed: number, dt: number }} Pose */
@@ -90,6 +101,25 @@ export const LandmarkKind = Object.freeze({ CONTACT: 0, LEAVING: 1, TIP: 2, TIP_
  * displacement over the stations so far, (index + 1, 2, 2) mm/N. `stations` are those before it.
  * @typedef {(wanted: Station, stations: Station[]) => { columns: Float32Array, rows: Numbers }} Answer
  */
+
+/** A volume, named as in echospline_volume_options. @typedef {{ level?: number, shape: Numbers, spacing: Numbers, origin: Numbers }} VolumeOptions */
+/**
+ * Point forces in space, named as in echospline_force_field: three numbers for each of `places` and `forces`, one of `radii`.
+ * @typedef {{
+ *   level?: number, top: number, poisson: number, shear_modulus: number, places: Numbers, forces: Numbers, radii: Numbers,
+ *   lattice_shape?: Numbers, lattice_spacing?: Numbers, lattice_origin?: Numbers, lattice?: Numbers
+ * }} ForceFieldOptions
+ */
+/**
+ * A probe's picture: `spacing` and `origin` of its pixels in its plane, mm; `step` pixels between the lattice's neighbours; `spread`,
+ * `mask` and `background` as in echospline_slice.
+ * @typedef {{
+ *   columns: number, rows: number, spacing: Numbers, origin: Numbers, step: number, spread?: Numbers, mask?: Uint8Array,
+ *   background?: number
+ * }} PlaneOptions
+ */
+/** What moves tissue: a field, or a tissue in space. @typedef {{ fieldAt: number } | Tissue} Moving */
+/** @typedef {{ residual: number, folded: number, jacobian: number, place: number[], outside: number }} PlaneReport */
 
 const BYTES = { i32: 4, u32: 4, i64: 8, f64: 8, pointer: 4 };
 
@@ -149,6 +179,29 @@ export const LAYOUTS = Object.freeze({
   echospline_picture_report: layout([
     ["struct_size", "u32"], ["method", "i32"], ["residual", "f64"], ["difference", "f64"], ["exact_share", "f64"],
     ["folded_cells", "i64"], ["smallest_jacobian", "f64"], ["place", "f64", 2],
+  ]),
+  echospline_look: layout([
+    ["struct_size", "u32"], ["level", "i32"], ["invert", "i32"], ["flip", "i32"], ["gain", "f64"],
+    ["recorded_range", "f64"], ["dynamic_range", "f64"], ["depth_gain_count", "i32"], ["reserved", "i32"],
+    ["depth_gains", "f64", 8],
+  ]),
+  echospline_volume_options: layout([
+    ["struct_size", "u32"], ["level", "i32"], ["shape", "i32", 3], ["reserved", "i32"], ["spacing", "f64", 3],
+    ["origin", "f64", 3],
+  ]),
+  echospline_slice: layout([
+    ["struct_size", "u32"], ["columns", "i32"], ["rows", "i32"], ["step", "i32"], ["normal", "f64", 3],
+    ["spread", "pointer"], ["mask", "pointer"], ["background", "i32"], ["reserved", "i32"],
+  ]),
+  echospline_force_field: layout([
+    ["struct_size", "u32"], ["level", "i32"], ["top", "i32"], ["reserved", "i32"], ["poisson", "f64"],
+    ["shear_modulus", "f64"], ["places", "pointer"], ["forces", "pointer"], ["radii", "pointer"], ["force_count", "i64"],
+    ["lattice_shape", "i32", 3], ["lattice_reserved", "i32"], ["lattice_spacing", "f64", 3], ["lattice_origin", "f64", 3],
+    ["lattice", "pointer"],
+  ]),
+  echospline_trace_report: layout([
+    ["struct_size", "u32"], ["reserved", "i32"], ["residual", "f64"], ["folded", "i64"], ["jacobian", "f64"],
+    ["place", "f64", 3],
   ]),
   echospline_forced_options: layout([
     ["struct_size", "u32"], ["level", "i32"], ["node_count", "i64"], ["low", "f64", 2], ["high", "f64", 2],
@@ -238,6 +291,39 @@ export class Core {
       const status = this.functions.echospline_follow(at, at + 2 * pose.size, at + pose.size);
       if (status !== Status.OK) throw new CoreError(status, this.text(this.functions.echospline_status_text(status)));
       return /** @type {any} */ (this.read(at + pose.size, pose));
+    } finally {
+      this.functions.free(at);
+    }
+  }
+
+  /** Pack a volume of 8-bit voxels, x fastest, then y. @param {VolumeOptions} options @param {Uint8Array} voxels @returns {Volume} */
+  volume(options, voxels) {
+    return new Volume(this, options, voxels);
+  }
+
+  /** Point forces in elastic tissue in space. @param {ForceFieldOptions} options @returns {ForceField} */
+  forceField(options) {
+    return new ForceField(this, options);
+  }
+
+  /** The picture of a plane through a volume. @param {Volume} volume @param {PlaneOptions} options @returns {PlanePicture} */
+  plane(volume, options) {
+    return new PlanePicture(volume, options);
+  }
+
+  /**
+   * Shade a grey picture in the module's memory into red, green, blue and alpha.
+   * @param {Look} look @param {number} grey address @param {number} columns @param {number} rows @param {number} rgba address
+   */
+  shade(look, grey, columns, rows, rgba) {
+    const shape = LAYOUTS.echospline_look;
+    const at = this.allocate(shape.size);
+    try {
+      this.write(at, shape, { struct_size: shape.size });
+      this.functions.echospline_look_defaults(at);
+      this.write(at, shape, { ...look, depth_gain_count: look.depth_gains?.length ?? 0 });
+      const status = this.functions.echospline_shade(at, grey, columns, rows, rgba, BigInt(4 * columns * rows));
+      if (status !== Status.OK) throw new CoreError(status, this.text(this.functions.echospline_status_text(status)));
     } finally {
       this.functions.free(at);
     }
@@ -688,6 +774,8 @@ export class Picture {
       const { columns, rows, channels, pixel_type, mesh_shape } = /** @type {any} */ (core.read(at, shape));
       /** @type {number} */
       this.pixels = columns * rows;
+      this.columns = columns;
+      this.grey = pixel_type === PixelType.UINT8 && channels === 1;
       const type = [Uint8Array, Uint16Array, Int16Array, Float32Array][pixel_type];
       const expected = this.pixels * channels;
       if (type === undefined || !(pixels instanceof type) || pixels.length !== expected) {
@@ -706,6 +794,7 @@ export class Picture {
     this.size = Number(core.functions.echospline_picture_size(this.handle));
     this.level = core.text(core.functions.echospline_level_name(core.functions.echospline_picture_level(this.handle)));
     this.out = core.allocate(this.size);
+    this.rgba = this.grey ? core.allocate(4 * this.pixels) : 0;
     this.field = core.allocate(8 * this.numbers);
     this.needle = core.allocate(LAYOUTS.echospline_needle.size);
   }
@@ -748,6 +837,16 @@ export class Picture {
     const at = needle === null ? 0 : this.placeNeedle(needle);
     this.check(this.core.functions.echospline_picture_draw(this.handle, at, this.out, BigInt(this.size)));
     return new this.type(this.core.buffer, this.out, this.size / this.type.BYTES_PER_ELEMENT);
+  }
+
+  /**
+   * Shade the picture that was drawn last, for ImageData: a view of red, green, blue and alpha.
+   * @param {Look} look @returns {Uint8ClampedArray}
+   */
+  shade(look) {
+    if (!this.grey) throw new CoreError(Status.WRONG_VALUE, "expected a picture of grey Uint8Array pixels; this one is not: draw it as it is");
+    this.core.shade(look, this.out, this.columns, this.pixels / this.columns, this.rgba);
+    return new Uint8ClampedArray(this.core.buffer, this.rgba, 4 * this.pixels);
   }
 
   /** Column and row of the reference that each pixel comes from; NaN where no tissue is. @returns {{ x: Float32Array, y: Float32Array }} */
@@ -811,8 +910,202 @@ export class Picture {
   destroy() {
     const { functions } = this.core;
     functions.echospline_picture_destroy(this.handle);
-    for (const at of [this.out, this.field, this.needle]) functions.free(at);
-    this.handle = this.out = this.field = this.needle = 0;
+    for (const at of [this.out, this.rgba, this.field, this.needle]) functions.free(at);
+    this.handle = this.out = this.rgba = this.field = this.needle = 0;
+  }
+}
+
+/** Voxels that probes make pictures of. */
+export class Volume {
+  /** @param {Core} core @param {VolumeOptions} options @param {Uint8Array} voxels */
+  constructor(core, options, voxels) {
+    this.core = core;
+    const shape = LAYOUTS.echospline_volume_options;
+    const [x, y, z] = Array.from(options.shape);
+    if (!(voxels instanceof Uint8Array) || voxels.length !== x * y * z) {
+      const came = `${voxels?.constructor.name} of ${voxels?.length}`;
+      throw new CoreError(Status.WRONG_SIZE, `expected Uint8Array of ${x * y * z} voxels (z, y, x); got ${came}`);
+    }
+    const at = core.allocate(shape.size);
+    const given = core.allocate(voxels.length);
+    try {
+      core.write(at, shape, { struct_size: shape.size, level: 0, reserved: 0, ...options });
+      new Uint8Array(core.buffer, given, voxels.length).set(voxels);
+      this.handle = core.create("volume", at, given);
+    } finally {
+      core.functions.free(at);
+      core.functions.free(given);
+    }
+  }
+
+  destroy() {
+    this.core.functions.echospline_volume_destroy(this.handle);
+    this.handle = 0;
+  }
+}
+
+/** Displacement by point forces in space, and a smooth one on a lattice. */
+export class ForceField {
+  /** @param {Core} core @param {ForceFieldOptions} options */
+  constructor(core, options) {
+    this.core = core;
+    const shape = LAYOUTS.echospline_force_field;
+    const count = options.radii.length;
+    if (options.places.length !== 3 * count || options.forces.length !== 3 * count) {
+      const came = `${options.places.length} and ${options.forces.length}`;
+      throw new CoreError(Status.WRONG_SIZE, `expected ${3 * count} numbers of places and of forces, three for each radius; got ${came}`);
+    }
+    this.places = core.place(options.places);
+    this.forces = core.place(options.forces);
+    this.radii = core.place(options.radii);
+    this.lattice = options.lattice ? core.place(options.lattice) : 0;
+    /** Address of echospline_force_field. */
+    this.fieldAt = core.allocate(shape.size);
+    new Uint8Array(core.buffer, this.fieldAt, shape.size).fill(0);
+    const { places, forces, radii, lattice } = this;
+    core.write(this.fieldAt, shape, { ...options, struct_size: shape.size, places, forces, radii, lattice, force_count: count });
+  }
+
+  /** Displacement of points in the undeformed tissue, three numbers each, mm. @param {Numbers} points @returns {Float64Array} */
+  displacementAt(points) {
+    return displacementOf(this.core, this.fieldAt, points);
+  }
+
+  destroy() {
+    for (const at of [this.places, this.forces, this.radii, this.lattice, this.fieldAt]) this.core.functions.free(at);
+    this.places = this.forces = this.radii = this.lattice = this.fieldAt = 0;
+  }
+}
+
+/** Displacement of points by a field in the module's memory. @param {Core} core @param {number} field address @param {Numbers} points @returns {Float64Array} */
+function displacementOf(core, field, points) {
+  const { functions } = core;
+  const count = points.length / 3;
+  const given = core.place(points);
+  const result = core.allocate(8 * points.length);
+  try {
+    const status = functions.echospline_force_field_at(field, given, BigInt(count), result);
+    if (status !== Status.OK) throw new CoreError(status, core.text(functions.echospline_status_text(status)));
+    return new Float64Array(core.buffer, result, points.length).slice();
+  } finally {
+    functions.free(given);
+    functions.free(result);
+  }
+}
+
+/** The picture of a plane through a volume, which moves: deformed as tissue is, with a needle's echo. */
+export class PlanePicture {
+  /** @param {Volume} volume @param {PlaneOptions} options */
+  constructor(volume, options) {
+    const { core } = volume;
+    const { columns, rows, step, mask, spread } = options;
+    this.core = core;
+    this.volume = volume;
+    this.options = options;
+    this.across = Math.ceil((columns - 1) / step) + 1;
+    this.numbers = 3 * this.across * (Math.ceil((rows - 1) / step) + 1);
+    const [dx, dy] = Array.from(options.spacing);
+    const mesh = { mesh_shape: [2, 2], mesh_spacing: [Math.max(columns - 1, 1) * dx, Math.max(rows - 1, 1) * dy] };
+    const look = { interpolation: Interpolation.NEAREST, mesh_origin: options.origin, origin: options.origin };
+    /** Draws the needle, and holds the picture. */
+    this.picture = core.picture({ columns, rows, spacing: options.spacing, ...mesh, ...look }, new Uint8Array(columns * rows));
+    this.places = core.allocate(8 * this.numbers);
+    this.lattice = core.allocate(8 * this.numbers);
+    this.slice = core.allocate(LAYOUTS.echospline_slice.size);
+    this.report = core.allocate(LAYOUTS.echospline_trace_report.size);
+    this.tip = core.allocate(24);
+    this.count = core.allocate(8);
+    this.sliced = core.allocate(columns * rows);
+    this.spread = 0;
+    this.mask = 0;
+    if (spread) {
+      this.spread = core.allocate(4 * rows);
+      new Float32Array(core.buffer, this.spread, rows).set(spread);
+    }
+    if (mask) {
+      this.mask = core.allocate(columns * rows);
+      new Uint8Array(core.buffer, this.mask, columns * rows).set(mask);
+    }
+  }
+
+  /**
+   * Draw the plane that a matrix (16 numbers, row by row) takes from the picture's frame to the scene's.
+   * @param {Numbers} matrix @param {Moving | null} moving @param {Needle | null} needle entry and tip in the scene's frame, mm
+   * @returns {Uint8Array} grey levels: a view
+   */
+  draw(matrix, moving, needle) {
+    const { core, volume, options } = this;
+    const { columns, rows, step } = options;
+    const { functions } = core;
+    const m = Array.from(matrix);
+    const shape = LAYOUTS.echospline_slice;
+    const { spread, mask } = this;
+    const given = { columns, rows, step, normal: [m[2], m[6], m[10]], spread, mask, background: options.background ?? 0 };
+    core.write(this.slice, shape, { ...given, struct_size: shape.size, reserved: 0 });
+    const places = new Float64Array(core.buffer, this.places, this.numbers);
+    for (let i = 0; i < this.numbers / 3; ++i) {
+      const x = options.origin[0] + (i % this.across) * step * options.spacing[0];
+      const y = options.origin[1] + Math.floor(i / this.across) * step * options.spacing[1];
+      for (let k = 0; k < 3; ++k) places[3 * i + k] = m[4 * k] * x + m[4 * k + 1] * y + m[4 * k + 3];
+    }
+    const report = LAYOUTS.echospline_trace_report;
+    core.write(this.report, report, { struct_size: report.size, residual: 0, folded: 0, jacobian: Infinity, place: [0, 0, 0] });
+    const numbers = BigInt(this.numbers);
+    if (moving !== null) {
+      if (needle) new Float64Array(core.buffer, this.tip, 3).set(/** @type {Numbers} */ (needle.tip));
+      const close = 0.05 * Math.min(options.spacing[0], options.spacing[1]); // a twentieth of a pixel, as in Python
+      const tip = needle ? this.tip : 0;
+      const { handle } = volume;
+      this.check("fieldAt" in moving
+        ? functions.echospline_volume_trace(
+          handle, this.slice, moving.fieldAt, this.places, numbers, tip, close, this.lattice, this.report)
+        : functions.echospline_volume_trace_tissue(
+          handle, this.slice, moving.handle, this.places, numbers, tip, close, this.lattice, this.report));
+    }
+    const from = moving === null ? this.places : this.lattice;
+    const bytes = BigInt(columns * rows);
+    this.check(functions.echospline_volume_slice(volume.handle, this.slice, from, numbers, this.sliced, bytes, this.count));
+    const picture = this.picture;
+    picture.check(functions.echospline_picture_reference(picture.handle, this.sliced, bytes));
+    const grey = picture.draw(needle ? this.lowered(m, needle) : null);
+    if (needle && this.mask) {
+      const shown = new Uint8Array(core.buffer, this.mask, columns * rows);
+      const background = options.background ?? 0;
+      for (let i = 0; i < grey.length; ++i) if (shown[i] === 0) grey[i] = background;
+    }
+    return /** @type {Uint8Array} */ (grey);
+  }
+
+  /** Needle in the frame of the plane. @param {number[]} m @param {Needle} needle @returns {Needle} */
+  lowered(m, needle) {
+    const [entry, tip] = [needle.entry, needle.tip].map((point) => {
+      const d = [0, 1, 2].map((k) => /** @type {any} */ (point)[k] - m[4 * k + 3]);
+      return [0, 1, 2].map((c) => m[c] * d[0] + m[4 + c] * d[1] + m[8 + c] * d[2]);
+    });
+    return { ...needle, entry, tip };
+  }
+
+  /** Shade the picture that was drawn last, for ImageData: a view. @param {Look} look @returns {Uint8ClampedArray} */
+  shade(look) {
+    return this.picture.shade(look);
+  }
+
+  /** How the last picture was traced back; `outside`: shown pixels outside the volume. @returns {PlaneReport} */
+  traced() {
+    const outside = Number(new BigInt64Array(this.core.buffer, this.count, 1)[0]);
+    return { .../** @type {any} */ (this.core.read(this.report, LAYOUTS.echospline_trace_report)), outside };
+  }
+
+  /** Throw unless a call succeeded. @param {number} status */
+  check(status) {
+    this.core.check(status, "volume", this.volume.handle);
+  }
+
+  destroy() {
+    this.picture.destroy();
+    const own = [this.places, this.lattice, this.slice, this.report, this.tip, this.count, this.sliced, this.spread, this.mask];
+    for (const at of own) this.core.functions.free(at);
+    this.places = this.lattice = this.slice = this.report = this.tip = this.count = this.sliced = this.spread = this.mask = 0;
   }
 }
 

@@ -70,6 +70,19 @@ class ForceField(ctypes.Structure):
     ]
 
 
+class TraceReport(ctypes.Structure):
+    """echospline_trace_report."""
+
+    _fields_ = [
+        ("struct_size", c_uint32),
+        ("reserved", c_int32),
+        ("residual", c_double),
+        ("folded", c_int64),
+        ("jacobian", c_double),
+        ("place", c_double * 3),
+    ]
+
+
 FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {  # name: result, arguments; handles and arrays are addresses
     "echospline_volume_create": (c_int32, [POINTER(VolumeOptions), c_void_p, POINTER(c_void_p)]),
     "echospline_volume_destroy": (None, [c_void_p]),
@@ -77,6 +90,34 @@ FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {  # name: result, arguments; hand
     "echospline_volume_slice": (
         c_int32,
         [c_void_p, POINTER(Slice), c_void_p, c_int64, c_void_p, c_int64, POINTER(c_int64)],
+    ),
+    "echospline_volume_trace": (
+        c_int32,
+        [
+            c_void_p,
+            POINTER(Slice),
+            POINTER(ForceField),
+            c_void_p,
+            c_int64,
+            c_void_p,
+            c_double,
+            c_void_p,
+            POINTER(TraceReport),
+        ],
+    ),
+    "echospline_volume_trace_tissue": (
+        c_int32,
+        [
+            c_void_p,
+            POINTER(Slice),
+            c_void_p,
+            c_void_p,
+            c_int64,
+            c_void_p,
+            c_double,
+            c_void_p,
+            POINTER(TraceReport),
+        ],
     ),
     "echospline_force_field_at": (c_int32, [POINTER(ForceField), c_void_p, c_int64, c_void_p]),
 }

@@ -1,4 +1,4 @@
-"""``echospline sessions``: list, export and score training sessions again, and make a cine of one."""
+"""``echospline sessions``: list, export, import and score training sessions again, and make a cine of one."""
 
 from __future__ import annotations
 
@@ -9,15 +9,16 @@ from typing import Annotated
 import typer
 
 from echospline import live as live_room
+from echospline import page as page_room
 from echospline import scenario as scenario_room
 from echospline import viewer
 from echospline.atomic import appearing, claimed
 from echospline.cli.live import default_sessions
 from echospline.cli.options import LOOKS, say
-from echospline.errors import InputError
+from echospline.errors import EchosplineError, InputError
 
 sessions = typer.Typer(
-    **LOOKS, no_args_is_help=True, help="Training sessions: list, export, score again, make a cine."
+    **LOOKS, no_args_is_help=True, help="Training sessions: list, export, import, score again, make a cine."
 )
 
 Kept = Annotated[
@@ -81,6 +82,74 @@ def export(
         part.write_text(text, encoding="utf-8", newline="")
 
 
+@sessions.command("import")
+def import_(
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE.json", help="what a page exported: one session or several")
+    ],
+    pack: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="TRAINER.html", help="the page that they come from; the shipped scene where not given"
+        ),
+    ] = None,
+    kept: Kept = None,
+) -> None:
+    """Run the sessions of a page again, compare every score with the page's, and store them.
+
+    Each is run by the native core on the page's own scene. A session whose numbers are not those of the page is stored with the difference;
+    one of another scene is not stored. Ends with 1 unless every session is verified.
+    """
+    given = page_room.read_sessions(file)
+    scene = None if pack is None else page_room.pack_of_page(pack)
+    stored = _open(kept, new=True)
+    sound = 0
+    for k, session in enumerate(given):
+        head = _printable(
+            f"{k + 1}. {session.trainee or 'nobody'}, {session.exercise.name}, {session.model}, attempt {session.attempt}"
+        )
+        try:
+            found = page_room.verify(scene or _shipped(session), session)
+        except EchosplineError as error:
+            print(f"{head}: not stored: {_printable(str(error))}")
+            continue
+        sound += not found.differences
+        said = _printable("; ".join(found.differences)) or "verified"
+        known = stored.number_of(session.digest)
+        if known is None:
+            made = {
+                "version": session.version, "core": session.core, "pack": session.scene.pack, "attempt": session.attempt,
+                "ended": session.ended,
+                "examination": session.examination, "events": session.events,
+            }  # fmt: skip
+            number = stored.add(
+                session.exercise, found.trace, found.score, trainee=session.trainee, scene=session.scene.title,
+                model=session.model,
+                imported=viewer.Import(session.when, "; ".join(found.differences) or "yes", made, session.digest),
+            )  # fmt: skip
+            print(f"{head}: {said}: stored as {number}")
+        else:
+            print(f"{head}: {said}: stored before as {known}")
+    print(f"{sound} of {len(given)} sessions verified")
+    if sound < len(given):
+        raise typer.Exit(1)
+
+
+def _printable(text: str) -> str:
+    """Return text of a file from elsewhere without what would steer a terminal."""
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
+
+
+def _shipped(session: page_room.RecordedSession) -> page_room.Pack:
+    """Return the shipped scene as the page of a session may have had it: in the language that gives its pack."""
+    scenario, image = scenario_room.Scenario().opened(Path.cwd(), eight_bit=True)
+    packs = [
+        page_room.packed(scenario, image, Path.cwd(), language=tongue, rate=session.rate)
+        for tongue in ("en", "de")
+    ]
+    return next((pack for pack in packs if pack.digest == session.scene.pack), packs[0])
+
+
 @sessions.command()
 def rescore(number: Number, kept: Kept = None) -> None:
     """Score a stored session again from its trace, and print both scores as JSON."""
@@ -133,8 +202,8 @@ def keyframes(trace: live_room.Trace) -> list[tuple[float, float, float, float, 
     return [(float(t), float(ex), float(ey), float(tx), float(ty)) for t, ex, ey, tx, ty in columns]
 
 
-def _open(kept: Path | None) -> viewer.Sessions:
+def _open(kept: Path | None, *, new: bool = False) -> viewer.Sessions:
     path = kept or default_sessions()
-    if not path.exists():
+    if not new and not path.exists():
         raise InputError(f"there are no sessions in {path}: finish an exercise in `echospline live` first")
     return viewer.Sessions(path)

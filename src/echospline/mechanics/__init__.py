@@ -13,7 +13,7 @@ if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.mechanics.kernels import Elastic, Kernel, ThinPlate
     from echospline.mechanics.landmark_stiffness import landmark_stiffness
     from echospline.mechanics.landmarks import Clamps
-    from echospline.mechanics.native import describe_core
+    from echospline.mechanics.native import CoreScene, NativeStep, describe_core
     from echospline.mechanics.neo_hookean_model import NeoHookeanModel
     from echospline.mechanics.parameters import TPSParameters
     from echospline.mechanics.protocol import TissueModel
@@ -26,12 +26,14 @@ else:
 __all__ = [
     "AnchoredKernel",
     "Clamps",
+    "CoreScene",
     "Elastic",
     "FEMModel",
     "ForceModel",
     "Forces",
     "GreenModel",
     "Kernel",
+    "NativeStep",
     "NeedleForces",
     "NeedleLoad",
     "NeoHookeanModel",

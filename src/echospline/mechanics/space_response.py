@@ -103,23 +103,17 @@ class ForceField:
         InputError
             If the core refuses a number.
         """
-        p = np.array(points, dtype=np.float64)
-        if self.top is not None:
-            np.maximum(p[:, 1], 0.0, out=p[:, 1])
-        return displacement(p, self.needle, self.young, self.poisson, self.top, self.smooth)
+        return displacement(points, self.needle, self.young, self.poisson, self.top, self.smooth)
+
+    def in_core(self) -> tuple[space.ForceField, list[Floats]]:
+        """Return the field as the core takes it, and the arrays that it points to: keep them as long as it is used."""
+        return in_core(self.needle, self.young, self.poisson, self.top, self.smooth)
 
 
-def displacement(
-    points: Floats, f: Forces, young: float, poisson: float, top: Top | None, smooth: Lattice | None = None
-) -> Floats:
-    """Sum closed forms in the core, single precision; shape (n, 3), mm. No point lies above a surface near a force.
-
-    Raises
-    ------
-    InputError
-        If the core refuses a number.
-    """
-    p = np.ascontiguousarray(points, dtype=np.float64)
+def in_core(
+    f: Forces, young: float, poisson: float, top: Top | None, smooth: Lattice | None
+) -> tuple[space.ForceField, list[Floats]]:
+    """Return a field as the core takes it, and the arrays that it points to."""
     o = space.ForceField(struct_size=ctypes.sizeof(space.ForceField), top=TOPS[top], poisson=poisson)
     o.shear_modulus, o.force_count = shear_modulus(young, poisson), len(f.places)
     arrays = [np.ascontiguousarray(v, dtype=np.float64) for v in (f.places, f.forces, f.radii)]
@@ -130,6 +124,21 @@ def displacement(
         o.lattice = values.ctypes.data
         o.lattice_shape[:], o.lattice_spacing[:] = values.shape[2::-1], [float(h) for h in smooth.spacing]
         o.lattice_origin[:] = [float(v) for v in smooth.origin]
+    return o, arrays
+
+
+def displacement(
+    points: Floats, f: Forces, young: float, poisson: float, top: Top | None, smooth: Lattice | None = None
+) -> Floats:
+    """Sum closed forms in the core, single precision; shape (n, 3), mm. Above a surface tissue moves as on it.
+
+    Raises
+    ------
+    InputError
+        If the core refuses a number.
+    """
+    p = np.ascontiguousarray(points, dtype=np.float64)
+    o, _kept = in_core(f, young, poisson, top, smooth)
     u = np.empty_like(p)
     status = space.library().echospline_force_field_at(ctypes.byref(o), p.ctypes.data, len(p), u.ctypes.data)
     if status != core.Status.OK:

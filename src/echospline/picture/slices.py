@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from math import ceil
 from time import perf_counter
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,17 @@ from echospline.scene import (
 
 Field = Callable[[Floats], Floats]
 """Displacement (n, 3) mm of reference points (n, 3) mm."""
+
+
+
+@runtime_checkable
+class CoreField(Protocol):
+    """A displacement that the core can sum itself: planes are then traced back there."""
+
+    def in_core(self) -> tuple[space.ForceField, list[Floats]]:
+        """Return the field as the core takes it, and the arrays that it points to."""
+        ...
+
 
 STEP = 8
 """Pixels between neighbours of the lattice."""
@@ -179,6 +191,54 @@ class NativeVolume:
         )  # fmt: skip
         core.check(status, self._core.echospline_volume_message, self._volume)
         return out, outside.value
+
+
+    def trace(
+        self,
+        places: Floats,
+        shape: tuple[int, int],
+        step: int,
+        field: CoreField,
+        tip: Floats | None,
+        close: float,
+    ) -> tuple[Floats, float, SpatialFolds | None]:
+        """Find where a slice's lattice comes from, in the core.
+
+        Parameters
+        ----------
+        places : ndarray, shape (m * k, 3)
+            Of the lattice's pixels in the deformed tissue, mm; see `slice` for the lattice, ``shape`` and ``step``.
+        field : CoreField
+            Displacement of the tissue.
+        tip : ndarray, shape (3,), optional
+            Of the needle, mm: around it folds are looked for.
+        close : float
+            Distance within which a place has to be reached, mm.
+
+        Returns
+        -------
+        origins : ndarray, shape (m * k, 3)
+            In undeformed tissue, mm.
+        residual : float
+            Largest distance midway between the places from the forward map of the origin there, mm.
+        folds : SpatialFolds or None
+        """
+        s = space.Slice(struct_size=ctypes.sizeof(space.Slice), columns=shape[0], rows=shape[1], step=step)
+        p = np.ascontiguousarray(places, dtype=np.float64)
+        given, _kept = field.in_core()
+        X = np.empty_like(p)
+        report = space.TraceReport(struct_size=ctypes.sizeof(space.TraceReport))
+        at = None if tip is None else np.ascontiguousarray(tip, dtype=np.float64)
+        status = self._core.echospline_volume_trace(
+            self._volume, ctypes.byref(s), ctypes.byref(given), p.ctypes.data, p.size,
+            None if at is None else at.ctypes.data, close, X.ctypes.data, ctypes.byref(report),
+        )  # fmt: skip
+        core.check(status, self._core.echospline_volume_message, self._volume)
+        folds = None
+        if report.folded:
+            x, y, z = report.place
+            folds = SpatialFolds(report.folded, report.jacobian, (x, y, z))
+        return X, report.residual, folds
 
 
 def origins(places: Floats, field: Field, close: float) -> tuple[Floats, Floats, Floats]:
@@ -327,6 +387,12 @@ class SliceDrawing:
     ) -> tuple[Floats, float, SpatialFolds | None]:
         """Return origins of the lattice, the residual midway between its points, and folds."""
         pixel = min(self.probe.grid.spacing)
+        if isinstance(field, CoreField):
+            tip = None if pose is None else np.array(pose.tip)
+            X, residual, folds = self._voxels.trace(
+                places, self.probe.grid.shape, STEP, field, tip, CLOSE * pixel
+            )
+            return X, residual / pixel, folds
         X, missed, jacobian = origins(places, field, CLOSE * pixel)
         shape = self._lattice.shape[::-1]
         corners = X.reshape(*shape, 3), places.reshape(*shape, 3)

@@ -6,6 +6,7 @@ from echospline.menu import on_demand
 
 if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.scenario.body_section import BodySection, bodies_of
+    from echospline.scenario.core_models import CoreScene, landmark_scene, landmark_steps
     from echospline.scenario.models import MODELS, build_model
     from echospline.scenario.run import run
     from echospline.scenario.scale import (
@@ -26,6 +27,7 @@ __all__ = [
     "MODELS",
     "PHANTOM",
     "BodySection",
+    "CoreScene",
     "DiscSection",
     "ExerciseSection",
     "Scenario",
@@ -35,6 +37,8 @@ __all__ = [
     "check_store",
     "describe",
     "is_spatial",
+    "landmark_scene",
+    "landmark_steps",
     "load",
     "needle_doubts",
     "open_spatial",

@@ -10,7 +10,7 @@ if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.viewer.scoring import score
     from echospline.viewer.served_scene import Scene
     from echospline.viewer.server import announce, build_app, serve, steer
-    from echospline.viewer.sessions import Sessions, sessions_csv, trace_csv
+    from echospline.viewer.sessions import Import, Sessions, sessions_csv, trace_csv
     from echospline.viewer.upload import UploadLimits
 else:
     on_demand(__name__)
@@ -18,6 +18,7 @@ else:
 __all__ = [
     "Disc",
     "Exercise",
+    "Import",
     "Scene",
     "Sessions",
     "Settings",

@@ -8,7 +8,7 @@ import json
 import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from echospline.viewer.exercise import Exercise
 from echospline.viewer.pictures import Pictures
 from echospline.viewer.scoring import Score
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS session (
   id INTEGER PRIMARY KEY,
@@ -35,17 +35,20 @@ CREATE TABLE IF NOT EXISTS session (
   score TEXT NOT NULL,        -- JSON
   trace BLOB NOT NULL,
   picture TEXT NOT NULL DEFAULT '', -- SHA-256 of the pixels, empty in sessions of schema 1
-  upload TEXT NOT NULL DEFAULT ''   -- name of the stored picture, empty for the scene that the server began with
+  upload TEXT NOT NULL DEFAULT '',  -- name of the stored picture, empty for the scene that the server began with
+  verified TEXT NOT NULL DEFAULT '', -- of an imported session: "yes", or how it differs from what its page said
+  made TEXT NOT NULL DEFAULT '',    -- of an imported session, JSON: what made it, its attempt, how it ended
+  digest TEXT NOT NULL DEFAULT ''   -- SHA-256 of an imported session, so that it is stored once
 )
 """
-_ADDED = ("picture", "upload")
-"""Columns that schema 1 lacks."""
-_COLUMNS = "id, started, trainee, exercise, scene, model, source, score, picture, upload"
+_ADDED = {2: ("picture", "upload"), 3: ("verified", "made", "digest")}
+"""Columns that came with a schema."""
+_COLUMNS = "id, started, trainee, exercise, scene, model, source, score, picture, upload, verified, made"
 
 
 @dataclass(frozen=True)
 class Session:
-    """One row of the list; `score` has the fields of `Score`."""
+    """One row of the list; `score` has the fields of `Score`, and `verified` and `made` are those of an `Import`."""
 
     id: int
     started: str
@@ -57,10 +60,34 @@ class Session:
     score: dict[str, Any]
     picture: str = ""
     upload: str = ""
+    verified: str = ""
+    made: dict[str, Any] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON, without the source."""
-        return {field.name: getattr(self, field.name) for field in fields(self) if field.name != "source"}
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "source"}
+
+
+@dataclass(frozen=True)
+class Import:
+    """What is known of a session that a page recorded on its own.
+
+    Parameters
+    ----------
+    started : str
+        UTC, ISO 8601.
+    verified : str
+        "yes", or how it differs from what its page said.
+    made : dict
+        Plain values: what made it, its attempt, how it ended.
+    digest : str
+        SHA-256 of the session; a session is stored once.
+    """
+
+    started: str
+    verified: str
+    made: dict[str, Any]
+    digest: str
 
 
 class Sessions:
@@ -91,8 +118,8 @@ class Sessions:
                     )
                 database.execute("PRAGMA journal_mode = WAL")
                 database.execute(_SCHEMA)
-                if version == 1:
-                    for column in _ADDED:
+                for schema in range(version + 1, SCHEMA_VERSION + 1) if version else ():
+                    for column in _ADDED[schema]:
                         database.execute(f"ALTER TABLE session ADD COLUMN {column} TEXT NOT NULL DEFAULT ''")
                 database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
         except (OSError, sqlite3.Error) as error:
@@ -112,17 +139,19 @@ class Sessions:
         source: str = "",
         picture: str = "",
         upload: str = "",
+        imported: Import | None = None,
     ) -> int:
         """Store a session in one transaction; returns its id."""
+        known = imported or Import(datetime.now(UTC).isoformat(timespec="seconds"), "", {}, "")
         row = (
-            datetime.now(UTC).isoformat(timespec="seconds"), trainee, exercise.name,
+            known.started, trainee, exercise.name,
             exercise.model_dump_json(), scene, source, model, json.dumps(score.to_dict()), trace.to_bytes(),
-            picture, upload,
+            picture, upload, known.verified, json.dumps(known.made) if known.made else "", known.digest,
         )  # fmt: skip
         with self._open() as database:
             cursor = database.execute(
                 "INSERT INTO session (started, trainee, exercise, definition, scene, source, model, score, trace, "
-                "picture, upload) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+                "picture, upload, verified, made, digest) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
                 row,
             )
             assert cursor.lastrowid is not None  # an INSERT has one
@@ -133,6 +162,12 @@ class Sessions:
         with self._open() as database:
             rows = database.execute(f"SELECT {_COLUMNS} FROM session ORDER BY id DESC LIMIT ?", (limit,))
             return [_session(row) for row in rows]
+
+    def number_of(self, digest: str) -> int | None:
+        """Return the number of the imported session of this SHA-256; None where it is not stored."""
+        with self._open() as database:
+            found = database.execute("SELECT id FROM session WHERE digest = ? LIMIT 1", (digest,)).fetchone()
+        return None if found is None else int(found[0])
 
     def needs(self, upload: str) -> bool:
         """Test whether a session was recorded in the uploaded picture of this name."""
@@ -172,27 +207,32 @@ class Sessions:
 
 
 def _session(columns: Sequence[Any]) -> Session:
-    number, started, trainee, exercise, scene, model, source, scored, picture, upload = columns
-    return Session(
-        number, started, trainee, exercise, scene, model, source, json.loads(scored), picture, upload
+    number, started, trainee, exercise, scene, model, source, scored, picture, upload, verified, made = (
+        columns
     )
+    return Session(
+        number, started, trainee, exercise, scene, model, source, json.loads(scored), picture, upload,
+        verified, json.loads(made) if made else {},
+    )  # fmt: skip
 
 
 def sessions_csv(sessions: list[Session]) -> str:
     """Write sessions as CSV, one row each, oldest first; units are in the header."""
     units = {"time": "s", "tissue_time": "s", "path_length": "mm", "path_inefficiency": "percent",
              "tissue_damage": "mm2", "smoothness": "mm/s^2.5", "final_error": "mm", "target_shift": "mm"}  # fmt: skip
-    names = [field.name for field in fields(Score)]
+    names = [f.name for f in fields(Score)]
     out = io.StringIO()
     writer = csv.writer(out)
     writer.writerow(
         ["id", "started", "trainee", "exercise", "scene", "model"]
         + [f"{name} ({units[name]})" if name in units else name for name in names]
+        + ["attempt", "verified"]
     )
     for session in reversed(sessions):
         writer.writerow(
             [session.id, session.started, _plain(session.trainee), _plain(session.exercise),
-             _plain(session.scene), session.model, *(session.score.get(name) for name in names)]
+             _plain(session.scene), session.model, *(session.score.get(name) for name in names),
+             session.made.get("attempt"), _plain(session.verified)]
         )  # fmt: skip
     return out.getvalue()
 

@@ -1,0 +1,214 @@
+// The engine: a pack's scene in the core, stepped and drawn. It knows no document and runs in node too.
+
+import { load } from "./../../_native/echospline.js";
+import { readPack } from "./scene.js";
+
+/** @import { Core, Picture, Pose } from "./../../_native/echospline.js" */
+/** @import { ModelEntry, Pack } from "./scene.js" */
+/** @typedef {{ entry: ArrayLike<number>, tip: ArrayLike<number> }} Hand where the hand wants the needle, mm */
+/**
+ * How grey becomes colour: gain and each slider of time-gain in dB, dynamic range in dB. The reference picture is shown as it is at
+ * gain 0 and RECORDED_RANGE.
+ * @typedef {{ gain: number, timeGain: number[], dynamicRange: number, invert: boolean }} Look
+ */
+/**
+ * What a model gives to the engine.
+ * @typedef {{ reset: () => void, advance: (pose: Pose) => void, deform: (picture: Picture) => void, at: (points: number[]) => ArrayLike<number>, save: () => Uint8Array, load: (saved: Uint8Array) => void, destroy: () => void }} Solver
+ */
+
+/** dB that the grey levels of a recorded picture are taken to span. */
+export const RECORDED_RANGE = 60;
+const OUT_OF_TISSUE = 1e-9; // mm; a shorter needle is not drawn, as in Python
+const STRAIGHT_SPEED = 10, STRAIGHT_STRIDE = 0.5; // mm/s and mm: how a new model is brought to the present pose
+
+export class Engine {
+  /** @param {Uint8Array | ArrayBuffer} coreBytes echospline.wasm @param {Uint8Array} packBytes */
+  static async open(coreBytes, packBytes) {
+    const pack = readPack(packBytes);
+    return new Engine(await load(/** @type {BufferSource} */ (coreBytes)), pack);
+  }
+
+  /** @param {Core} core @param {Pack} pack */
+  constructor(core, pack) {
+    this.core = core;
+    this.pack = pack;
+    this.dt = 1 / pack.rate;
+    this.model = pack.models[0];
+    /** @type {Pose} */
+    this.pose = home(pack);
+    const { image, mesh } = pack;
+    if (!image) throw new Error("This page shows scenes in the plane; a volume needs a page of a later version.");
+    const pixels = /** @type {Uint8Array} */ (pack.array(image.pixels));
+    this.picture = core.picture({
+      columns: image.columns, rows: image.rows, spacing: image.spacing, origin: image.origin,
+      mesh_shape: mesh.shape, mesh_spacing: mesh.spacing, mesh_origin: mesh.origin,
+    }, pixels);
+    this.columns = image.columns;
+    this.rows = image.rows;
+    this.colours = new Uint8ClampedArray(4 * image.columns * image.rows);
+    this.table = new Uint32Array(256);
+    /** @type {Solver} */
+    this.solver = solverOf(core, pack, this.model);
+    this.stale = true; // the picture's deformation is older than the tissue's
+  }
+
+  /** Change the model and keep the pose: the new one begins with a straight insertion to it. @param {string} name */
+  choose(name) {
+    const entry = this.pack.models.find((model) => model.name === name);
+    if (!entry) throw new Error(`This scene has no model ${JSON.stringify(name)}; it has ${this.pack.models.map((model) => model.name).join(", ")}.`);
+    const next = solverOf(this.core, this.pack, entry);
+    this.solver.destroy();
+    this.solver = next;
+    this.model = entry;
+    this.stale = true;
+    const { entry: from, tip } = this.pose, way = Array.from(tip, (value, d) => value - from[d]);
+    const depth = Math.hypot(...way), steps = Math.ceil(depth / STRAIGHT_STRIDE);
+    for (let k = 1; k <= steps; ++k) {
+      const part = Array.from(from, (value, d) => value + (way[d] * k) / steps);
+      this.solver.advance({ entry: from, tip: part, speed: STRAIGHT_SPEED, dt: depth / steps / STRAIGHT_SPEED });
+    }
+  }
+
+  /** Needle out and home, tissue at rest. @param {ArrayLike<number>} [entry] where home is, mm */
+  reset(entry = this.pack.needle.entry) {
+    this.solver.reset();
+    this.pose = { entry: Array.from(entry), tip: Array.from(entry), speed: 0, dt: this.dt };
+    this.stale = true;
+  }
+
+  /** One step of 1/rate s towards the hand. @param {Hand} hand @returns {Pose} */
+  step(hand) {
+    const { lag, fastest } = this.pack.needle;
+    return this.take(this.core.follow(this.pose, { ...hand, lag, fastest }, this.dt));
+  }
+
+  /** One step to a recorded pose. @param {Pose} pose @returns {Pose} */
+  take(pose) {
+    this.solver.advance(pose);
+    this.pose = pose;
+    this.stale = true;
+    return pose;
+  }
+
+  /** Tissue and needle now, to come back to. @returns {{ pose: Pose, tissue: Uint8Array }} */
+  save() {
+    return { pose: this.pose, tissue: this.solver.save() };
+  }
+
+  /** @param {{ pose: Pose, tissue: Uint8Array }} saved */
+  load(saved) {
+    this.solver.load(saved.tissue);
+    this.pose = saved.pose;
+    this.stale = true;
+  }
+
+  /**
+   * Run recorded poses through a model of its own, from rest; the engine stays as it is.
+   * @param {string} name @param {Float64Array} poses rows of [entry, tip, speed] @param {number} rate steps per second @param {number[]} places flat, mm
+   * @returns {Float64Array} where the places lie after every row
+   */
+  retrace(name, poses, rate, places) {
+    const entry = this.pack.models.find((model) => model.name === name);
+    if (!entry) throw new Error(`This scene has no model ${JSON.stringify(name)}.`);
+    const solver = solverOf(this.core, this.pack, entry), rows = poses.length / 5, watched = new Float64Array(rows * places.length);
+    try {
+      for (let row = 0; row < rows; ++row) {
+        solver.advance(poseOf(poses, row, 1 / rate));
+        const moved = solver.at(places);
+        for (let k = 0; k < places.length; ++k) watched[row * places.length + k] = places[k] + moved[k];
+      }
+    } finally {
+      solver.destroy();
+    }
+    return watched;
+  }
+
+  /** Displacement of reference points, mm. @param {number[]} points flat @returns {ArrayLike<number>} flat */
+  displacementAt(points) {
+    return points.length ? this.solver.at(points) : [];
+  }
+
+  /** The picture now, grey. @returns {Uint8Array} a view, right until the next call into the core */
+  grey() {
+    if (this.stale) this.solver.deform(this.picture);
+    this.stale = false;
+    const { entry, tip } = this.pose;
+    const inside = Math.hypot(...Array.from(tip, (value, d) => value - entry[d])) >= OUT_OF_TISSUE;
+    return /** @type {Uint8Array} */ (this.picture.draw(inside ? { ...this.pack.needle.echo, entry, tip } : null));
+  }
+
+  /** The picture now in colour, (rows, columns, 4). @param {Look} look @returns {Uint8ClampedArray<ArrayBuffer>} */
+  draw(look) {
+    shadeInto(this.colours, this.grey(), this.columns, this.rows, look);
+    return this.colours;
+  }
+
+  /** The last deformation's check. */
+  get report() {
+    return this.picture.report();
+  }
+}
+
+/** A recorded pose. @param {Float64Array} poses rows of [entry x, y, tip x, y, speed] @param {number} row @param {number} dt s @returns {Pose} */
+export function poseOf(poses, row, dt) {
+  const k = 5 * row;
+  return { entry: [poses[k], poses[k + 1]], tip: [poses[k + 2], poses[k + 3]], speed: poses[k + 4], dt };
+}
+
+/** The needle out of the tissue. @param {Pack} pack @returns {Pose} */
+function home(pack) {
+  return { entry: [...pack.needle.entry], tip: [...pack.needle.entry], speed: 0, dt: 1 / pack.rate };
+}
+
+/** @param {Core} core @param {Pack} pack @param {ModelEntry} model @returns {Solver} */
+function solverOf(core, pack, model) {
+  const given = Object.fromEntries(Object.entries(model.arrays).map(([name, array]) => [name, pack.array(array)]));
+  if (model.kind !== "landmarks") return forcedSolver(core, model, given);
+  const scene = core.scene({ ...model.options, ...given }), tissue = scene.tissue();
+  return {
+    reset: () => tissue.reset(),
+    advance: (pose) => tissue.advance(pose),
+    deform: (picture) => picture.follow(tissue),
+    at: (points) => tissue.displacementAt(points),
+    save: () => tissue.save(),
+    load: (saved) => tissue.load(saved),
+    destroy: () => {
+      tissue.destroy();
+      scene.destroy();
+    },
+  };
+}
+
+/** @param {Core} core @param {ModelEntry} model @param {Record<string, any>} given @returns {Solver} */
+function forcedSolver(core, model, given) {
+  void core, given;
+  throw new Error(`The core of this page does not know how ${model.label} answers forces.`);
+}
+
+/**
+ * Colour of every pixel: grey plus the gain of its row, stretched about white when the dynamic range shrinks.
+ * @param {Uint8ClampedArray<ArrayBuffer>} out @param {Uint8Array} grey @param {number} columns @param {number} rows @param {Look} look
+ */
+export function shadeInto(out, grey, columns, rows, look) {
+  const words = new Uint32Array(out.buffer), table = new Uint32Array(256), share = RECORDED_RANGE / look.dynamicRange;
+  let last = NaN;
+  for (let row = 0; row < rows; ++row) {
+    const gain = look.gain + timeGainAt(look.timeGain, rows > 1 ? row / (rows - 1) : 0);
+    if (gain !== last) {
+      for (let g = 0; g < 256; ++g) {
+        const level = Math.min(255, Math.max(0, Math.round(255 + (g + (255 * gain) / RECORDED_RANGE - 255) * share)));
+        const shown = look.invert ? 255 - level : level;
+        table[g] = (shown * 0x010101) | 0xff000000;
+      }
+      last = gain;
+    }
+    for (let k = row * columns, end = k + columns; k < end; ++k) words[k] = table[grey[k]];
+  }
+}
+
+/** Time-gain at a share of the depth: linear between sliders. @param {number[]} sliders dB @param {number} share @returns {number} dB */
+export function timeGainAt(sliders, share) {
+  if (sliders.length < 2) return sliders[0] ?? 0;
+  const at = share * (sliders.length - 1), k = Math.min(sliders.length - 2, Math.floor(at));
+  return sliders[k] + (at - k) * (sliders[k + 1] - sliders[k]);
+}

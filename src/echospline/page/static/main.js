@@ -1,0 +1,445 @@
+// The page: one loop at the screen's rate. It steps the tissue, draws when something has changed, and carries out what is asked.
+
+import { inflated, sha256 } from "./bytes.js";
+import { Reel, download, fileName, newCanvas, pngOf } from "./capture.js";
+import { closableDialogs, openDialog, showAttempts, showCurve, showSummary } from "./dialogs.js";
+import { drawList } from "./draw_list.js";
+import { Engine, poseOf } from "./engine.js";
+import { Input } from "./input.js";
+import { Panels, byId, inputOf, put } from "./panels.js";
+import { Renderer } from "./renderer.js";
+import { initialState, next, tipOf } from "./state.js";
+import { Store, keepChoices, keptChoices } from "./store.js";
+import { Attempt, fileOf, landmarksOf, posesOf, readSessions } from "./training.js";
+import { LANGUAGES, wordsOf } from "./words.js";
+
+/** @import { Live } from "./draw_list.js" */
+/** @import { Action, State } from "./state.js" */
+/** @import { Origin, Session } from "./training.js" */
+/** @import { Trace } from "./scoring.js" */
+
+const LONGEST_FRAME = 0.1; // s of model time that one frame makes up for; a slower screen loses time rather than falling behind
+const CHECKPOINT = 240; // rows of a replay between states to go back to
+const STILL = 0.002; // mm that tissue moves before it is drawn again
+const NOTICE = 5000; // ms
+
+/** @type {Engine} */
+let engine;
+/** @type {State} */
+let state;
+/** @type {Panels} */
+let panels;
+/** @type {Renderer} */
+let renderer;
+/** @type {Input} */
+let input;
+/** @type {ImageData} */
+let image;
+/** @type {Origin} */
+let origin;
+/** @type {Live} */
+let live;
+/** @type {Attempt | null} */
+let attempt = null;
+/** @type {Session | null} the attempt that the summary shows */
+let summed = null;
+/** @type {Session | null} */
+let expert = null;
+/** @type {{ poses: Float64Array, expert: Float64Array | null, row: number, saved: { row: number, state: ReturnType<Engine["save"]> }[] } | null} */
+let film = null;
+const store = new Store(), reel = new Reel();
+let last = 0, due = 0, halted = false, noticeTimer = 0, attemptNumber = 0;
+/** @type {State | null} */
+let drawnState = null;
+/** @type {number[]} */
+let drawnSamples = [];
+/** Counts that tests and measurements read from the stage's data. */
+const counts = { drawn: 0, steps: 0 };
+
+const say = (/** @type {string} */ key, /** @type {Record<string, string | number>} */ values = {}) => wordsOf(state?.language ?? "en")(key, values);
+
+async function begin() {
+  const [coreBytes, packBytes] = await Promise.all(["core", "scene"].map((id) => inflated(byId(id).textContent ?? "")));
+  engine = await Engine.open(coreBytes, packBytes);
+  const { pack } = engine, choices = keptChoices(), light = matchMedia("(prefers-color-scheme: light)").matches;
+  state = initialState(pack, {
+    language: LANGUAGES.includes(choices.language) ? choices.language : LANGUAGES.includes(pack.language) ? pack.language : "en",
+    theme: choices.theme === "light" || choices.theme === "dark" ? choices.theme : light ? "light" : "dark",
+  });
+  inputOf("trainee").value = choices.trainee ?? "";
+  origin = { version: pack.version, core: "", title: pack.title, pack: "" };
+  const picture = pack.image ?? { columns: 2, rows: 2, spacing: [1, 1], origin: [0, 0] };
+  live = { entry: engine.pose.entry, tip: engine.pose.tip, speed: 0, watched: [], expert: null, picture: { ...picture, spacing: [picture.spacing[0], picture.spacing[1]], origin: [picture.origin[0], picture.origin[1]] } };
+  image = new ImageData(engine.colours, engine.columns, engine.rows);
+  renderer = new Renderer(/** @type {HTMLCanvasElement} */ (byId("canvas")), newCanvas);
+  panels = new Panels(pack, act, command);
+  input = new Input(byId("stage"), () => state, act, command);
+  closableDialogs();
+  wire();
+  new ResizeObserver(fit).observe(byId("stage"));
+  fit();
+  panels.show(state, attemptNumber);
+  requestAnimationFrame(frame);
+  await store.open();
+  // once the picture stands: names of scene and core for the sessions to come
+  setTimeout(() => (origin = { ...origin, core: sha256(coreBytes), pack: sha256(packBytes) }), 300);
+}
+
+/** @param {Action} action */
+function act(action) {
+  state = next(state, action);
+}
+
+function fit() {
+  const box = byId("stage").getBoundingClientRect();
+  renderer.resize(box.width, box.height, devicePixelRatio || 1);
+  act({ do: "resize", width: box.width, height: box.height });
+  drawnState = null;
+}
+
+// --- the loop
+
+/** @param {number} now ms */
+function frame(now) {
+  requestAnimationFrame(frame);
+  const dt = last ? Math.min((now - last) / 1000, LONGEST_FRAME) : 0;
+  last = now;
+  input.tick(dt);
+  try {
+    if (state.replay) playOn(dt);
+    else if (!state.frozen && !halted) stepOn(dt);
+    if (drawnState !== state || hasMoved()) draw(now);
+  } catch (error) {
+    halted = true;
+    fault(say("stopped", { reason: messageOf(error) }));
+  }
+}
+
+/** Make the steps that are due. @param {number} dt s */
+function stepOn(dt) {
+  due += dt * state.rate;
+  const hand = { entry: state.needle.entry, tip: tipOf(state.needle) };
+  for (; due >= 1; --due) {
+    const pose = engine.step(hand);
+    ++counts.steps;
+    if (!attempt || !state.run) continue;
+    attempt.add(pose, watchedNow(attempt.places));
+    if (attempt.steps >= Math.round(attempt.exercise.time_limit * state.rate)) {
+      due = 0;
+      finish("time");
+      return;
+    }
+  }
+  if (attempt && state.run && Math.floor(attempt.steps / state.rate) !== Math.floor(state.run.steps / state.rate)) act({ do: "stepped", steps: attempt.steps });
+}
+
+/** Where places lie in the tissue now. @param {number[]} places flat, mm */
+function watchedNow(places) {
+  const moved = engine.displacementAt(places);
+  return places.map((value, k) => value + moved[k]);
+}
+
+/** Places whose motion decides whether a new picture is needed: needle, its surroundings, a coarse lattice, targets. */
+function samples() {
+  const { entry, tip } = engine.pose, { x0, x1, y0, y1 } = state.extent, points = [];
+  for (const part of [0.33, 0.66, 1]) for (const side of [-2, 0, 2]) points.push(entry[0] + part * (tip[0] - entry[0]) + side, Math.max(y0, entry[1] + part * (tip[1] - entry[1])));
+  for (let k = 0; k < 16; ++k) points.push(x0 + ((k % 4) + 0.5) * 0.25 * (x1 - x0), y0 + (Math.floor(k / 4) + 0.5) * 0.25 * (y1 - y0));
+  const inside = points.map((value, k) => (k % 2 ? Math.min(Math.max(value, y0), y1) : Math.min(Math.max(value, x0), x1)));
+  return [...Array.from(entry), ...Array.from(tip), ...Array.from(engine.displacementAt(inside))];
+}
+
+function hasMoved() {
+  if (!engine.stale) return false;
+  const now = samples();
+  return now.length !== drawnSamples.length || now.some((value, k) => Math.abs(value - drawnSamples[k]) > STILL);
+}
+
+/** @param {number} now ms */
+function draw(now) {
+  const pictured = !drawnState || engine.stale || drawnState.look !== state.look;
+  const exercise = state.run?.exercise ?? state.replay?.exercise ?? state.exercises.find((one) => one.name === state.chosen);
+  const { entry, tip, speed } = engine.pose;
+  live = { ...live, entry, tip, speed, watched: exercise ? watchedNow(landmarksOf(exercise)) : [], expert: expertNow() };
+  if (engine.stale) drawnSamples = samples();
+  if (pictured) {
+    engine.draw(state.look);
+    renderer.picture(image);
+  }
+  const list = drawList(state, live, say);
+  renderer.draw(list);
+  reel.add(now, engine.colours, engine.columns, engine.rows, list);
+  panels.show(state, attemptNumber);
+  drawnState = state;
+  Object.assign(byId("stage").dataset, { ready: "true", drawn: String(++counts.drawn), steps: String(counts.steps), depth: Math.hypot(tip[0] - entry[0], tip[1] - entry[1]).toFixed(3), model: state.model });
+}
+
+// --- training
+
+function start() {
+  act({ do: "start", lot: Math.random() });
+  if (!state.run) return;
+  const trainee = inputOf("trainee").value.trim(), { exercise, examination } = state.run;
+  renew();
+  attempt = new Attempt(exercise, state.rate, state.model, examination, trainee, new Date());
+  attemptNumber = 1 + store.sessions.filter((session) => session.exercise.name === exercise.name && session.trainee === trainee).length;
+  drawnState = null;
+}
+
+/** End the attempt, keep it, and show it unless the person began anew. @param {"finished" | "reset" | "time"} how */
+function finish(how) {
+  const made = attempt;
+  attempt = null;
+  act({ do: "stop" });
+  if (!made || made.steps === 0) return;
+  const session = made.session(how, attemptNumber, origin);
+  store.add([session]).then(() => notice(store.refused ? say("not-stored", { reason: store.refused }) : say("stored")));
+  if (how !== "reset") summarise(session, made.trace);
+}
+
+/** Needle out, tissue at rest. */
+function renew() {
+  halted = false;
+  fault("");
+  film = null;
+  due = 0;
+  engine.reset(state.needle.entry);
+}
+
+/** @param {Session} session @param {Trace} trace */
+function summarise(session, trace) {
+  summed = session;
+  const past = store.sessions.filter((one) => one.exercise.name === session.exercise.name && one.trainee === session.trainee);
+  const other = expert && expert !== session && expert.exercise.name === session.exercise.name && expert.steps ? retraced(expert) : null;
+  showSummary(state, session, trace, other, past);
+}
+
+/** The trace of a kept attempt, by running it again. @param {Session} session @returns {Trace} */
+function retraced(session) {
+  const poses = posesOf(session), places = landmarksOf(session.exercise);
+  return { period: 1 / session.rate, poses, watched: engine.retrace(session.model, poses, session.rate, places), places: places.length / 2 };
+}
+
+/** Whether this scene can show a session; says why not. @param {Session} session */
+function playable(session) {
+  const other = session.scene.pack !== origin.pack ? say("other-scene") : state.models.includes(session.model) ? "" : say("no-model", { name: session.model });
+  put(byId("attempts-said"), other);
+  return !other;
+}
+
+function sessions() {
+  showAttempts(state, store.sessions, expert, {
+    replay: (session) => playable(session) && replay(session),
+    expert: (session) => {
+      if (!playable(session)) return;
+      expert = expert === session ? null : session;
+      sessions();
+    },
+  });
+}
+
+// --- replay
+
+/** @param {Session} session */
+function replay(session) {
+  for (const dialog of document.querySelectorAll("dialog")) dialog.close();
+  if (session.steps === 0) return;
+  if (state.run) finish("reset");
+  renew();
+  engine.choose(session.model);
+  const poses = posesOf(session), beside = expert && expert !== session ? posesOf(expert) : null;
+  engine.reset([poses[0], poses[1]]);
+  film = { poses, expert: beside, row: 0, saved: [] };
+  act({ do: "replay", replay: { exercise: session.exercise, model: session.model, length: session.steps, events: session.events, expert: beside !== null } });
+  panels.events(state, (step) => act({ do: "scrub", at: step }));
+  byId("stage").focus({ preventScroll: true });
+}
+
+/** @param {number} dt s */
+function playOn(dt) {
+  if (!film || !state.replay) return;
+  if (!state.replay.paused) act({ do: "played", rows: dt * state.rate * state.replay.speed });
+  const wanted = Math.floor(state.replay.at);
+  if (wanted < film.row) {
+    const from = film.saved.filter(({ row }) => row <= wanted).pop();
+    if (from) engine.load(from.state);
+    else engine.reset([film.poses[0], film.poses[1]]);
+    film.row = from?.row ?? 0;
+  }
+  for (; film.row < wanted; ++film.row) {
+    if (film.row % CHECKPOINT === 0 && !film.saved.some(({ row }) => row === film?.row)) film.saved.push({ row: film.row, state: engine.save() });
+    engine.take(poseOf(film.poses, film.row, 1 / state.rate));
+  }
+  const { entry, tip } = engine.pose, depth = Math.hypot(tip[0] - entry[0], tip[1] - entry[1]);
+  const angle = depth > 0.01 ? (Math.atan2(tip[1] - entry[1], tip[0] - entry[0]) * 180) / Math.PI : state.needle.angle;
+  if (entry[0] !== state.needle.entry[0] || depth !== state.needle.depth || angle !== state.needle.angle) act({ do: "adopt", needle: { entry: [entry[0], entry[1]], depth, angle } });
+}
+
+/** The expert's needle at this moment of the replay. */
+function expertNow() {
+  if (!film?.expert || !state.replay) return null;
+  return poseOf(film.expert, Math.min(film.expert.length / 5 - 1, Math.max(0, film.row - 1)), 1);
+}
+
+// --- what is asked
+
+/** @param {string} asked */
+function command(asked) {
+  const [name, value = ""] = asked.split(":"), done = COMMANDS[name];
+  if (done) done(value);
+  else if (name.startsWith("model-")) model(state.models[Number(name.slice(6))] ?? state.model);
+  else act({ do: name });
+}
+
+/** @type {Record<string, (value: string) => void>} */
+const COMMANDS = {
+  reset: () => {
+    if (state.run) finish("reset");
+    act({ do: "reset" });
+    renew();
+  },
+  exercise: () => (state.run ? finish("finished") : state.replay ? COMMANDS.leave("") : start()),
+  leave: () => {
+    act({ do: "leave" });
+    renew();
+  },
+  play: () => act({ do: "pause" }),
+  model: (name) => model(name),
+  "zoom-in": () => act({ do: "zoom", factor: 1.25 }),
+  "zoom-out": () => act({ do: "zoom", factor: 0.8 }),
+  guide: () => act({ do: "help", name: "guide" }),
+  rings: () => act({ do: "help", name: "rings" }),
+  readouts: () => act({ do: "help", name: "readouts" }),
+  caliper: () => act({ do: "tool", name: "caliper" }),
+  note: () => act({ do: "tool", name: "note" }),
+  mark: () => (state.tool === "note" ? COMMANDS.write("") : act({ do: "mark" })),
+  write: () => {
+    if (!state.cursor) act({ do: "cursor" });
+    inputOf("write-text").value = "";
+    openDialog("write");
+  },
+  escape: () => state.tool !== "needle" && act({ do: "tool", name: state.tool }),
+  flat: () => act({ do: "flatGain" }),
+  help: () => void openDialog("help"),
+  sessions: () => sessions(),
+  language: () => act({ do: "language", name: LANGUAGES[(LANGUAGES.indexOf(state.language) + 1) % LANGUAGES.length] }) ?? kept(),
+  theme: () => act({ do: "theme" }) ?? kept(),
+  picture: () => void pngOf(renderer.canvas).then((blob) => saved(blob, fileName("picture", "png"))),
+  clip: () => void clip(),
+};
+
+/** @param {string} name */
+function model(name) {
+  if (state.run) return notice(say("model-kept"));
+  if (state.replay || name === state.model) return;
+  try {
+    engine.choose(name);
+    act({ do: "model", name });
+  } catch (error) {
+    notice(messageOf(error));
+    drawnState = null;
+  }
+}
+
+async function clip() {
+  if (reel.seconds === 0) return notice(say("clip-none"));
+  notice(say("clip-works", { seconds: reel.seconds.toFixed(0) }));
+  try {
+    const blob = await reel.record(state.view.width, state.view.height);
+    saved(blob, fileName("clip", blob.type.includes("mp4") ? "mp4" : "webm"));
+  } catch (error) {
+    notice(say("clip-refused", { reason: messageOf(error) }));
+  }
+}
+
+/** @param {Blob} blob @param {string} name */
+function saved(blob, name) {
+  download(blob, name);
+  notice(say("saved", { name }));
+}
+
+/** @param {Session[]} list */
+function exportSessions(list) {
+  saved(new Blob([fileOf(list)], { type: "application/json" }), fileName("sessions", "json"));
+}
+
+/** @param {File} file */
+async function importSessions(file) {
+  try {
+    const read = readSessions(await file.text());
+    await store.add(read);
+    sessions();
+    put(byId("attempts-said"), say("imported", { count: read.length }));
+  } catch (error) {
+    put(byId("attempts-said"), messageOf(error));
+  }
+}
+
+/** Keep the choices for the next visit. */
+function kept() {
+  keepChoices({ language: state.language, theme: state.theme, trainee: inputOf("trainee").value });
+}
+
+// --- wires
+
+function wire() {
+  inputOf("scrub").addEventListener("input", () => {
+    act({ do: "scrub", at: Number(inputOf("scrub").value) });
+    if (!state.replay?.paused) act({ do: "pause" });
+  });
+  inputOf("speed").addEventListener("change", () => act({ do: "speed", value: Number(inputOf("speed").value) }));
+  inputOf("trainee").addEventListener("change", kept);
+  byId("again").addEventListener("click", () => {
+    /** @type {HTMLDialogElement} */ (byId("summary")).close();
+    start();
+  });
+  byId("watch").addEventListener("click", () => summed && replay(summed));
+  byId("export-one").addEventListener("click", () => summed && exportSessions([summed]));
+  byId("export-all").addEventListener("click", () => exportSessions(store.sessions));
+  byId("import").addEventListener("click", () => inputOf("import-file").click());
+  inputOf("import-file").addEventListener("change", () => {
+    const file = inputOf("import-file").files?.[0];
+    if (file) void importSessions(file);
+    inputOf("import-file").value = "";
+  });
+  byId("erase").addEventListener("click", () => confirm(say("erase-sure")) && void store.erase().then(sessions));
+  for (const id of ["progress-of", "progress-who"]) byId(id).addEventListener("change", () => showCurve(state, store.sessions));
+  byId("write-form").addEventListener("submit", () => state.cursor && act({ do: "note", at: state.cursor, text: inputOf("write-text").value }));
+  for (const button of document.querySelectorAll("[data-hold]")) {
+    const code = /** @type {HTMLElement} */ (button).dataset.hold ?? "";
+    button.addEventListener("pointerdown", (event) => {
+      button.setPointerCapture(/** @type {PointerEvent} */ (event).pointerId);
+      input.hold(code, true);
+    });
+    for (const name of ["pointerup", "pointercancel", "lostpointercapture"]) button.addEventListener(name, () => input.hold(code, false));
+  }
+  // After a click the keys steer again; who tabs to a control keeps it.
+  document.addEventListener("click", (event) => {
+    const target = /** @type {HTMLElement} */ (event.target), control = target.closest("button, summary, input[type=range], input[type=checkbox], input[type=radio]");
+    if (event.detail > 0 && control && !control.closest("dialog") && !document.querySelector("dialog[open]")) byId("stage").focus({ preventScroll: true });
+  });
+  setInterval(() => panels.spoken(state, live), 500);
+  if (matchMedia("(max-width: 640px)").matches) for (const panel of document.querySelectorAll("details.panel")) /** @type {HTMLDetailsElement} */ (panel).open = false;
+}
+
+/** @param {string} text */
+function notice(text) {
+  const line = byId("notice");
+  put(line, text);
+  line.hidden = false;
+  clearTimeout(noticeTimer);
+  noticeTimer = setTimeout(() => (line.hidden = true), NOTICE);
+}
+
+/** @param {string} text */
+function fault(text) {
+  put(byId("fault"), text);
+  byId("fault").hidden = !text;
+}
+
+/** @param {unknown} error */
+function messageOf(error) {
+  const text = error instanceof Error ? error.message : String(error);
+  return /[.!?]$/.test(text) ? text : `${text}.`;
+}
+
+begin().catch((error) => fault(messageOf(error)));

@@ -1,0 +1,52 @@
+"""The models of a scenario as every host of the core takes them, and steps of the native core from what such a host was given."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from echospline.errors import InputError
+from echospline.mechanics import CoreScene, NativeStep, TPSModel
+from echospline.scenario.models import build_model
+from echospline.scenario.scenario import Scenario
+from echospline.scene import RegularGrid
+
+__all__ = ["CoreScene", "landmark_scene", "landmark_steps"]
+
+LANDMARKS = ("tps", "elastic")
+"""Models of landmarks."""
+
+
+def landmark_scene(scenario: Scenario, grid: RegularGrid, kind: str, folder: Path) -> CoreScene:
+    """Return what the core is given for a model of landmarks.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Its [tissue], [mesh] and [model].
+    grid : RegularGrid
+        The mesh.
+    kind : {"tps", "elastic"}
+        The model.
+    folder : Path
+        Start of the scenario's relative paths.
+
+    Raises
+    ------
+    InputError
+        If it is no model of landmarks, or its parameters are invalid.
+    """
+    model = build_model(scenario, grid, kind=kind, folder=folder)
+    if not isinstance(model, TPSModel) or model.native is None:
+        raise InputError(f"a model of landmarks is one of {', '.join(LANDMARKS)}; got {kind!r}")
+    return model.native.scene
+
+
+def landmark_steps(scene: CoreScene) -> NativeStep:
+    """Return the native core's steps of a scene of landmarks.
+
+    Raises
+    ------
+    InputError, SolverError
+        If the core refuses it.
+    """
+    return NativeStep(scene)
