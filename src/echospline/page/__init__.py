@@ -10,8 +10,9 @@ if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.page.pack import Pack
     from echospline.page.packing import packed
     from echospline.page.replay import Verified, pack_of_page, replay, verify
+    from echospline.page.rules import beyond, broken_rules
     from echospline.page.scoring import Score, score
-    from echospline.page.sessions_file import RecordedSession, read_sessions
+    from echospline.page.sessions_file import RecordedSession, parsed_sessions, read_sessions
 else:
     on_demand(__name__)
 
@@ -22,11 +23,14 @@ __all__ = [
     "RecordedSession",
     "Score",
     "Verified",
+    "beyond",
+    "broken_rules",
     "bundle",
     "check_exercises",
     "default_exercises",
     "pack_of_page",
     "packed",
+    "parsed_sessions",
     "read_sessions",
     "replay",
     "score",
