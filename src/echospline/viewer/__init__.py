@@ -5,30 +5,45 @@ from typing import TYPE_CHECKING
 from echospline.menu import on_demand
 
 if TYPE_CHECKING:  # the menu, loaded on demand
+    from echospline.viewer.class_answers import (
+        class_answer,
+        curves_csv,
+        session_file,
+        sessions_csv,
+        sessions_file,
+        trace_csv,
+    )
     from echospline.viewer.exercise import Disc, Exercise, default_exercises
+    from echospline.viewer.learning_curve import Criterion
     from echospline.viewer.room import Settings
     from echospline.viewer.scoring import score
     from echospline.viewer.served_scene import Scene
     from echospline.viewer.server import announce, build_app, serve, steer
-    from echospline.viewer.sessions import Import, Sessions, sessions_csv, trace_csv
+    from echospline.viewer.sessions import Record, Session, Sessions
     from echospline.viewer.upload import UploadLimits
 else:
     on_demand(__name__)
 
 __all__ = [
+    "Criterion",
     "Disc",
     "Exercise",
-    "Import",
+    "Record",
     "Scene",
+    "Session",
     "Sessions",
     "Settings",
     "UploadLimits",
     "announce",
     "build_app",
+    "class_answer",
+    "curves_csv",
     "default_exercises",
     "score",
     "serve",
+    "session_file",
     "sessions_csv",
+    "sessions_file",
     "steer",
     "trace_csv",
 ]

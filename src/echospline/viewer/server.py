@@ -26,13 +26,14 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from echospline.errors import EchosplineError, InputError
 from echospline.scene import NeedlePose
 from echospline.viewer.aside import aside
+from echospline.viewer.class_answers import sessions_csv, trace_csv
 from echospline.viewer.client import Client
 from echospline.viewer.guard import SUBPROTOCOL, Guard
 from echospline.viewer.idle import close_idle
 from echospline.viewer.protocol import COMMAND_BYTES, REQUEST_BYTES
 from echospline.viewer.room import LOOPBACK, Room, Settings
 from echospline.viewer.served_scene import Scene, SceneOpener, grey_bytes
-from echospline.viewer.sessions import Sessions, sessions_csv, trace_csv
+from echospline.viewer.sessions import Sessions
 from echospline.viewer.upload import UploadError, Uploads
 from echospline.viewer.words import for_page
 
