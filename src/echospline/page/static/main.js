@@ -33,10 +33,10 @@ let panels;
 let renderer;
 /** @type {Input} */
 let input;
-/** @type {ImageData} */
-let image;
 /** @type {Origin} */
 let origin;
+/** Names of scene and core for the sessions; made when they are first needed, once the picture stands. @type {() => Origin} */
+let named = () => origin;
 /** @type {Live} */
 let live;
 /** @type {Attempt | null} */
@@ -70,7 +70,6 @@ async function begin() {
   origin = { version: pack.version, core: "", title: pack.title, pack: "" };
   const picture = pack.image ?? { columns: 2, rows: 2, spacing: [1, 1], origin: [0, 0] };
   live = { entry: engine.pose.entry, tip: engine.pose.tip, speed: 0, watched: [], expert: null, picture: { ...picture, spacing: [picture.spacing[0], picture.spacing[1]], origin: [picture.origin[0], picture.origin[1]] } };
-  image = new ImageData(engine.colours, engine.columns, engine.rows);
   renderer = new Renderer(/** @type {HTMLCanvasElement} */ (byId("canvas")), newCanvas);
   panels = new Panels(pack, act, command);
   input = new Input(byId("stage"), () => state, act, command);
@@ -79,10 +78,13 @@ async function begin() {
   new ResizeObserver(fit).observe(byId("stage"));
   fit();
   panels.show(state, attemptNumber);
+  named = () => {
+    if (!origin.core) origin = { ...origin, core: sha256(coreBytes), pack: sha256(packBytes) };
+    return origin;
+  };
+  setTimeout(named, 500);
   requestAnimationFrame(frame);
   await store.open();
-  // once the picture stands: names of scene and core for the sessions to come
-  setTimeout(() => (origin = { ...origin, core: sha256(coreBytes), pack: sha256(packBytes) }), 300);
 }
 
 /** @param {Action} action */
@@ -162,12 +164,13 @@ function draw(now) {
   live = { ...live, entry, tip, speed, watched: exercise ? watchedNow(landmarksOf(exercise)) : [], expert: expertNow() };
   if (engine.stale) drawnSamples = samples();
   if (pictured) {
-    engine.draw(state.look);
-    renderer.picture(image);
+    const colours = engine.draw(state.look);
+    renderer.picture(new ImageData(colours, engine.columns, engine.rows));
+    reel.add(now, colours, engine.columns, engine.rows);
   }
   const list = drawList(state, live, say);
   renderer.draw(list);
-  reel.add(now, engine.colours, engine.columns, engine.rows, list);
+  reel.over(now, list);
   panels.show(state, attemptNumber);
   drawnState = state;
   Object.assign(byId("stage").dataset, { ready: "true", drawn: String(++counts.drawn), steps: String(counts.steps), depth: Math.hypot(tip[0] - entry[0], tip[1] - entry[1]).toFixed(3), model: state.model });
@@ -191,7 +194,7 @@ function finish(how) {
   attempt = null;
   act({ do: "stop" });
   if (!made || made.steps === 0) return;
-  const session = made.session(how, attemptNumber, origin);
+  const session = made.session(how, attemptNumber, named());
   store.add([session]).then(() => notice(store.refused ? say("not-stored", { reason: store.refused }) : say("stored")));
   if (how !== "reset") summarise(session, made.trace);
 }
@@ -221,7 +224,7 @@ function retraced(session) {
 
 /** Whether this scene can show a session; says why not. @param {Session} session */
 function playable(session) {
-  const other = session.scene.pack !== origin.pack ? say("other-scene") : state.models.includes(session.model) ? "" : say("no-model", { name: session.model });
+  const other = session.scene.pack !== named().pack ? say("other-scene") : state.models.includes(session.model) ? "" : say("no-model", { name: session.model });
   put(byId("attempts-said"), other);
   return !other;
 }
