@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { sha256 } from "../../src/echospline/page/static/bytes.js";
+import { digest, sha256 } from "../../src/echospline/page/static/bytes.js";
 import { Film } from "../../src/echospline/page/static/film.js";
 import { Attempt, landmarksOf, posesOf } from "../../src/echospline/page/static/training.js";
 import { EXERCISE, core, engine } from "../node/made_pack.mjs";
@@ -103,4 +103,9 @@ test("the name of bytes is their SHA-256", () => {
     assert.equal(sha256(bytes), createHash("sha256").update(bytes).digest("hex"));
   }
   for (const length of [55, 56, 63, 64, 65]) assert.equal(sha256(new Uint8Array(length).fill(7)), createHash("sha256").update(new Uint8Array(length).fill(7)).digest("hex"));
+});
+
+test("the browser's own digest gives the same name", async () => {
+  const bytes = new Uint8Array(core);
+  assert.equal(await digest(bytes), sha256(bytes));
 });

@@ -1,6 +1,6 @@
 // The page: one loop at the screen's rate. It steps the tissue, draws when something has changed, and carries out what is asked.
 
-import { inflated, sha256 } from "./bytes.js";
+import { digest, inflated, sha256 } from "./bytes.js";
 import { Reel, download, fileName, newCanvas, pngOf } from "./capture.js";
 import { closableDialogs, openDialog, showAttempts, showCurve, showSummary } from "./dialogs.js";
 import { drawList } from "./draw_list.js";
@@ -20,6 +20,7 @@ import { LANGUAGES, wordsOf } from "./words.js";
 /** @import { Trace } from "./scoring.js" */
 
 const LONGEST_FRAME = 0.1; // s of model time that one frame makes up for; a slower screen loses time rather than falling behind
+const PANELS = 50; // ms between changes of the panels, which cost the browser a layout
 const STILL = 0.002; // mm that tissue moves before it is drawn again
 const NOTICE = 5000; // ms
 
@@ -48,7 +49,7 @@ let expert = null;
 /** @type {Film | null} */
 let film = null;
 const store = new Store(), reel = new Reel();
-let last = 0, due = 0, halted = false, noticeTimer = 0, attemptNumber = 0;
+let last = 0, due = 0, shownAt = 0, halted = false, noticeTimer = 0, attemptNumber = 0;
 /** @type {State | null} */
 let drawnState = null;
 /** @type {number[]} */
@@ -82,7 +83,10 @@ async function begin() {
     if (!origin.core) origin = { ...origin, core: sha256(coreBytes), pack: sha256(packBytes) };
     return origin;
   };
-  setTimeout(named, 500);
+  setTimeout(async () => {
+    const [core, scene] = await Promise.all([coreBytes, packBytes].map(digest));
+    if (core && scene) origin = { ...origin, core, pack: scene };
+  }, 500);
   requestAnimationFrame(frame);
   await store.open();
 }
@@ -111,6 +115,10 @@ function frame(now) {
     if (state.replay) playOn(dt);
     else if (!state.frozen && !halted) stepOn(dt);
     if (drawnState !== state || hasMoved()) draw(now);
+    if (now - shownAt >= PANELS) {
+      shownAt = now;
+      panels.show(state, attemptNumber);
+    }
   } catch (error) {
     halted = true;
     fault(say("stopped", { reason: messageOf(error) }));
@@ -171,7 +179,6 @@ function draw(now) {
   const list = drawList(state, live, say);
   renderer.draw(list);
   reel.over(now, list);
-  panels.show(state, attemptNumber);
   drawnState = state;
   Object.assign(byId("stage").dataset, { ready: "true", drawn: String(++counts.drawn), steps: String(counts.steps), depth: Math.hypot(tip[0] - entry[0], tip[1] - entry[1]).toFixed(3), model: state.model });
 }
