@@ -230,8 +230,8 @@ def sources() -> list[Path]:
 def functions() -> list[str]:
     """Names of the C interface's functions, in the headers' order."""
     folder = ROOT / "core" / "include" / "echospline"
-    headers = "".join((folder / name).read_text(encoding="utf-8") for name in ("echospline.h", "space.h"))
-    return re.findall(r"^ECHOSPLINE_API[^;(]*?\b(echospline_\w+)\(", headers, flags=re.MULTILINE)
+    text = "".join((folder / name).read_text(encoding="utf-8") for name in ("echospline.h", "green.h", "space.h"))
+    return re.findall(r"^ECHOSPLINE_API[^;(]*?\b(echospline_\w+)\(", text, flags=re.MULTILINE)
 
 
 @functools.cache

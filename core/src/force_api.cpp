@@ -4,17 +4,10 @@
 #include <cstdlib>
 #include <cstring>
 
-#include "force_entries.hpp"
+#include "force_handle.hpp"
 
 using echospline::Level;
 using echospline::Message;
-
-struct echospline_forced {
-  const Level* level = nullptr;
-  void* self = nullptr;
-  int64_t nodes = 0;
-  Message message;
-};
 
 namespace {
 
@@ -126,6 +119,7 @@ echospline_status echospline_forced_create(const echospline_forced_options* opti
         made.message, ECHOSPLINE_WRONG_VALUE, "level must be one that this processor has, at most %s; got %d (%s)",
         echospline_level_name(echospline_level_best()), options->level, echospline_level_name(options->level));
   made.nodes = options->node_count;
+  for (int d = 0; d < 2; ++d) made.low[d] = options->low[d], made.high[d] = options->high[d];
   made.self = made.level->force->create(*options);
   if (!made.self) return refuse(made.message, ECHOSPLINE_OUT_OF_MEMORY, "memory ran out while the tissue was built");
   return ECHOSPLINE_OK;

@@ -1,6 +1,6 @@
 // Tissue under a needle's forces at one processor level, and its states as bytes.
 #pragma once
-#include "../include/echospline/stick_slip.hpp"
+#include "../include/echospline/green.hpp"
 #include "force_entries.hpp"
 #include "tissue_level.hpp"
 
@@ -24,8 +24,8 @@ struct SlipSaved {
 };
 static_assert(sizeof(SlipHeader) == 104 && sizeof(SlipSaved) == 72);
 
-inline SlipTissue& forced(void* f) { return *static_cast<SlipTissue*>(f); }
-inline const SlipTissue& forced(const void* f) { return *static_cast<const SlipTissue*>(f); }
+inline GreenTissue& forced(void* f) { return *static_cast<GreenTissue*>(f); }
+inline const GreenTissue& forced(const void* f) { return *static_cast<const GreenTissue*>(f); }
 
 inline echospline_status status_of(SlipTissue::Outcome outcome) {
   switch (outcome) {
@@ -62,7 +62,7 @@ inline void* create_forced(const echospline_forced_options& o) {
                        o.dead_band,
                        {o.low[0], o.low[1]},
                        {o.high[0], o.high[1]}};
-  SlipTissue* made = create<SlipTissue>(law, o.node_count);
+  GreenTissue* made = create<GreenTissue>(law, o.node_count);
   if (made && !made->build()) {
     destroy(made);
     return nullptr;
@@ -151,7 +151,10 @@ constexpr ForceEntries force_entries = {
     create_forced,
     [](void* f) { destroy(&forced(f)); },
     [](void* f) { forced(f).rest(); },
-    [](void* f, const echospline_pose& pose) { return status_of(forced(f).advance(pose)); },
+    [](void* f, const echospline_pose& pose) {
+      GreenTissue& own = forced(f);
+      return status_of(own.answered_by_green([&] { return own.advance(pose); }));
+    },
     [](void* f, echospline_station* out) {
       SlipTissue& own = forced(f);
       if (out && own.wanted_index >= 0) describe(own.wanted, own.wanted_index, *out);
@@ -170,8 +173,14 @@ constexpr ForceEntries force_entries = {
       if (room >= own.state.count) own.forces(out);
       return own.state.count;
     },
-    [](void* f, double* out) { return status_of(forced(f).displacement(out)); },
-    [](void* f, float* out) { return status_of(forced(f).displacement(out)); },
+    [](void* f, double* out) {
+      GreenTissue& own = forced(f);
+      return status_of(own.answered_by_green([&] { return own.displacement(out); }));
+    },
+    [](void* f, float* out) {
+      GreenTissue& own = forced(f);
+      return status_of(own.answered_by_green([&] { return own.displacement(out); }));
+    },
     [](const void* f) {
       return static_cast<int64_t>(sizeof(SlipHeader) + sizeof(uint64_t)) +
              forced(f).state.count * static_cast<int64_t>(sizeof(SlipSaved));

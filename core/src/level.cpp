@@ -1,6 +1,7 @@
 // The core at one processor level. Compiled once per level with -DECHOSPLINE_LEVEL=baseline, avx2, avx512, neon or simd128.
 #include "../include/echospline/level_begin.hpp"
 #include "force_level.hpp"
+#include "green_level.hpp"
 #include "picture_level.hpp"
 #include "space_level.hpp"
 #include "tissue_level.hpp"
@@ -19,5 +20,6 @@ extern "C" {
 extern const echospline::Level ECHOSPLINE_JOIN(echospline_level_, ECHOSPLINE_LEVEL);
 const echospline::Level ECHOSPLINE_JOIN(echospline_level_, ECHOSPLINE_LEVEL) = {
     ECHOSPLINE_LEVEL, &echospline::ECHOSPLINE_CORE::tissue_entries, &echospline::ECHOSPLINE_CORE::picture_entries,
-    &echospline::ECHOSPLINE_CORE::force_entries, &echospline::ECHOSPLINE_CORE::space_entries};
+    &echospline::ECHOSPLINE_CORE::force_entries, &echospline::ECHOSPLINE_CORE::space_entries,
+    &echospline::ECHOSPLINE_CORE::green_entries};
 }

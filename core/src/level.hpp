@@ -18,6 +18,7 @@ struct Message {
 struct TissueEntries;   // scenes and tissues: tissue_entries.hpp
 struct PictureEntries;  // pictures: picture_entries.hpp
 struct ForceEntries;    // tissue under a needle's forces: force_entries.hpp
+struct GreenEntries;    // Green's function of tissue: green_entries.hpp
 struct SpaceEntries;    // volumes and fields of forces: space_entries.hpp
 
 /// One level of the processor.
@@ -27,6 +28,7 @@ struct Level {
   const PictureEntries* picture;
   const ForceEntries* force;
   const SpaceEntries* space;
+  const GreenEntries* green;
 };
 
 /// Table of a level, or nullptr where the library does not hold it or the processor cannot run it. `ECHOSPLINE_LEVEL_BEST` is the best one.

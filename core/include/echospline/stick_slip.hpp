@@ -366,6 +366,13 @@ class SlipTissue {
     return room == room_ || make_room(room);
   }
   void drop_step() { pending_ = false, wanted_index = -1; }
+  /// Forget what stations have been answered: something else answers from now on.
+  void forget_answers() {
+    drop_step();
+    answers_ = 0;
+  }
+  /// Whether every station of the state has its answer; else asks for the first that has none.
+  Outcome answered_all() { return answered(state); }
 
  private:
   SlipState work_;

@@ -27,6 +27,10 @@ export const Interpolation = Object.freeze({ LINEAR: 0, NEAREST: 1 });
 export const Border = Object.freeze({ BORDER_VALUE: 0, BORDER_TRANSPARENT: 1 });
 export const Method = Object.freeze({ METHOD_AUTO: 0, METHOD_EXACT: 1, METHOD_PULL: 2 });
 export const NeedlePart = Object.freeze({ SHAFT: 1, BEVEL: 2, TAIL: 4, SHADOW: 8 });
+export const GreenMethod = Object.freeze({ GREEN_BOUNDARY: 0, GREEN_SOLVE: 1 });
+export const GreenCondition = Object.freeze({
+  CONDITION_CLAMPED: 0, CONDITION_SLIDING_X: 1, CONDITION_SLIDING_Y: 2, CONDITION_FREE: 3, CONDITION_INTERFACE: 4,
+});
 export const LandmarkKind = Object.freeze({ CONTACT: 0, LEAVING: 1, TIP: 2, TIP_LEFT: 3 });
 
 export const Top = Object.freeze({ TOP_NONE: 0, TOP_FREE: 1, TOP_SLIDING: 2 });
@@ -120,6 +124,11 @@ export const Top = Object.freeze({ TOP_NONE: 0, TOP_FREE: 1, TOP_SLIDING: 2 });
  */
 /** What moves tissue: a field, or a tissue in space. @typedef {{ fieldAt: number } | Tissue} Moving */
 /** @typedef {{ residual: number, folded: number, jacobian: number, place: number[], outside: number }} PlaneReport */
+/**
+ * How tissue answers forces: members of echospline_green_options without counts, as `GreenResponse.tables()` of the Python package writes
+ * them; typed arrays may be of any type, and flat.
+ * @typedef {Record<string, number | Numbers> & { shape: Numbers, spacing: Numbers, origin: Numbers }} GreenTables
+ */
 
 const BYTES = { i32: 4, u32: 4, i64: 8, f64: 8, pointer: 4 };
 
@@ -213,6 +222,30 @@ export const LAYOUTS = Object.freeze({
     ["point_count", "i32"], ["reserved", "i32"],
   ]),
   echospline_needle_load: layout([["tip", "f64"], ["friction", "f64"], ["side", "f64"], ["torque", "f64"], ["cut", "f64"]]),
+  echospline_green_options: layout([
+    ["struct_size", "u32"], ["level", "i32"], ["method", "i32"], ["clamped", "u32"], ["sliding", "u32"], ["shape", "i32", 2],
+    ["reserved", "i32"], ["spacing", "f64", 2], ["origin", "f64", 2], ["radius", "f64"], ["weight", "f64"],
+    ["pin_weight", "f64"], ["pin_radius", "f64"], ["lattice", "f64"], ["bodies", "pointer"], ["depths", "pointer"],
+    ["circles", "pointer"], ["sources", "pointer"], ["source_counts", "pointer"], ["conditions", "pointer"],
+    ["sides", "pointer"], ["pins", "pointer"], ["order", "pointer"], ["right", "pointer"], ["left", "pointer"],
+    ["body_count", "i64"], ["band_count", "i64"], ["source_count", "i64"], ["condition_count", "i64"],
+    ["pin_count", "i64"], ["rank", "i64"], ["lines_x", "pointer"], ["lines_y", "pointer"], ["moduli", "pointer"],
+    ["held", "pointer"], ["line_x_count", "i64"], ["line_y_count", "i64"], ["triangle_count", "i64"],
+    ["held_count", "i64"],
+  ]),
+});
+
+/**
+ * Tables of echospline_green_options: the member that counts their entries, numbers per entry, type.
+ * @type {Readonly<Record<string, [string, number, Float64ArrayConstructor | Int32ArrayConstructor | Uint8ArrayConstructor]>>}
+ */
+const GREEN_TABLES = Object.freeze({
+  bodies: ["body_count", 2, Float64Array], depths: ["", 1, Float64Array], circles: ["", 3, Float64Array],
+  sources: ["source_count", 2, Float64Array], source_counts: ["", 1, Int32Array],
+  conditions: ["condition_count", 4, Float64Array], sides: ["", 3, Int32Array], pins: ["pin_count", 2, Float64Array],
+  order: ["rank", 1, Int32Array],
+  lines_x: ["line_x_count", 1, Float64Array], lines_y: ["line_y_count", 1, Float64Array],
+  moduli: ["triangle_count", 2, Float64Array], held: ["held_count", 1, Uint8Array],
 });
 
 /** A call of the core that did not succeed; `status` is one of Status. */
@@ -275,6 +308,14 @@ export class Core {
    */
   forced(options, answer) {
     return new Forced(this, options, answer);
+  }
+
+  /**
+   * The same where the core answers: Green's function from its tables. Node count and corners of the options follow from them.
+   * @param {Partial<ForcedOptions>} options @param {GreenTables} tables @returns {Green}
+   */
+  green(options, tables) {
+    return new Green(this, options, tables);
   }
 
   /**
@@ -631,6 +672,121 @@ export class Forced {
   }
 }
 
+/** Tissue in the plane under a needle that sticks, slips and cuts, which answers forces by Green's function in the core. */
+export class Green extends Forced {
+  /** @param {Core} core @param {Partial<ForcedOptions>} options @param {GreenTables} tables */
+  constructor(core, options, tables) {
+    const { shape, spacing, origin } = tables;
+    const high = [0, 1].map((d) => origin[d] + spacing[d] * (shape[d] - 1));
+    super(core, { ...options, node_count: shape[0] * shape[1], low: origin, high }, () => {
+      throw new CoreError(Status.NEEDS_STATION, "expected an attached green to answer; it was detached");
+    });
+    this.response = 0;
+    try {
+      this.response = createGreen(core, tables, options.level ?? 0);
+      this.check(core.functions.echospline_forced_attach(this.handle, this.response));
+    } catch (error) {
+      this.destroy();
+      throw error;
+    }
+  }
+
+  /** Displacement of reference points in the tissue, two numbers each, mm. @param {Numbers} points @returns {Float64Array} */
+  displacementAt(points) {
+    const { functions } = this.core;
+    const given = this.core.place(points);
+    const result = this.core.allocate(8 * points.length);
+    try {
+      this.check(functions.echospline_forced_displacement_at(this.handle, given, BigInt(points.length / 2), result));
+      return new Float64Array(this.core.buffer, result, points.length).slice();
+    } finally {
+      functions.free(given);
+      functions.free(result);
+    }
+  }
+
+  /**
+   * Displacement of the mesh nodes and of points under load cases, in that order: (nodes + points, 2, cases) mm.
+   * @param {Numbers} places (m, 2) mm @param {Numbers} forces (m, 2, cases) N @param {Numbers} points (p, 2) mm
+   * @returns {Float64Array}
+   */
+  answers(places, forces, points) {
+    const { functions } = this.core;
+    const cases = forces.length / places.length;
+    const [mesh, at] = [this.numbers * cases, points.length * cases];
+    const given = [places, forces, points].map((numbers) => this.core.place(numbers));
+    const result = this.core.allocate(8 * (mesh + at));
+    try {
+      const status = functions.echospline_green_answer(
+        this.response, given[0], BigInt(places.length / 2), given[1], BigInt(cases), given[2], BigInt(points.length / 2),
+        result, BigInt(mesh), result + 8 * mesh, BigInt(at));
+      this.core.check(status, "green", this.response);
+      return new Float64Array(this.core.buffer, result, mesh + at).slice();
+    } finally {
+      for (const address of [...given, result]) functions.free(address);
+    }
+  }
+
+  destroy() {
+    super.destroy();
+    this.core.functions.echospline_green_destroy(this.response);
+    this.response = 0;
+  }
+}
+
+/** Make a response from its tables. @param {Core} core @param {GreenTables} tables @param {number} level @returns {number} handle */
+function createGreen(core, tables, level) {
+  const shape = LAYOUTS.echospline_green_options;
+  const known = new Set(shape.fields.map(({ name }) => name));
+  const unknown = Object.keys(tables).filter((name) => !known.has(name));
+  if (unknown.length > 0) {
+    throw new CoreError(Status.WRONG_VALUE, `expected names of echospline_green_options; got ${unknown.join(", ")}`);
+  }
+  checkLengths(tables);
+  const at = core.allocate(shape.size);
+  /** @type {Record<string, number>} */
+  const placed = {};
+  /** @type {Record<string, number>} */
+  const counts = {};
+  try {
+    for (const [name, [count, width, type]] of Object.entries(GREEN_TABLES)) {
+      const given = /** @type {Numbers | undefined} */ (tables[name]);
+      if (given === undefined) continue;
+      if (given.length % width !== 0) {
+        throw new CoreError(Status.WRONG_SIZE, `expected ${width} numbers per entry of ${name}; got ${given.length}`);
+      }
+      placed[name] = core.allocate(type.BYTES_PER_ELEMENT * given.length);
+      new type(core.buffer, placed[name], given.length).set(given);
+      if (count !== "") counts[count] = given.length / width;
+    }
+    core.write(at, shape, { struct_size: shape.size });
+    core.functions.echospline_green_defaults(at);
+    core.write(at, shape, { ...tables, ...placed, ...counts, level });
+    return core.create("green", at);
+  } finally {
+    for (const address of [at, ...Object.values(placed)]) core.functions.free(address);
+  }
+}
+
+/** Refuse tables that are shorter than others say: the core has no other way to know. @param {GreenTables} tables */
+function checkLengths(tables) {
+  const length = (/** @type {string} */ name) => /** @type {Numbers | undefined} */ (tables[name])?.length ?? 0;
+  const bodies = length("bodies") / 2;
+  const bands = Number(tables.band_count ?? 0);
+  const expected = [
+    ["depths", bodies > 0 ? bands + 1 : 0], ["circles", bodies > 0 ? 3 * (bodies - bands) : 0], ["source_counts", bodies],
+    ["sides", 3 * length("conditions") / 4],
+  ];
+  for (const [name, count] of /** @type {[string, number][]} */ (expected)) {
+    if (length(name) !== count) {
+      throw new CoreError(Status.WRONG_SIZE, `expected ${count} numbers of ${name}; got ${length(name)}`);
+    }
+  }
+  for (const name of ["right", "left"]) {
+    if (tables[name] !== undefined) throw new CoreError(Status.WRONG_VALUE, `expected no ${name}: the core finds it`);
+  }
+}
+
 /** One needle's session in a scene. */
 export class Tissue {
   /** @param {Scene} scene */
@@ -827,8 +983,17 @@ export class Picture {
     this.check(deform(this.handle, this.field, BigInt(this.numbers)));
   }
 
-  /** Deform as a tissue in the plane is now; the mesh has to be the tissue's. @param {Tissue} tissue */
+  /** Deform as a tissue in the plane is now, without a copy; the mesh has to be the tissue's. @param {Tissue | Forced} tissue */
   follow(tissue) {
+    if (tissue instanceof Forced) {
+      if (tissue.numbers !== this.numbers) {
+        throw new CoreError(Status.WRONG_SIZE, `expected a tissue of ${this.numbers / 2} nodes; got ${tissue.numbers / 2}`);
+      }
+      const { functions } = this.core;
+      tissue.displacementSingle();
+      this.check(functions.echospline_picture_deform_single(this.handle, tissue.field, BigInt(this.numbers)));
+      return;
+    }
     this.check(this.core.functions.echospline_picture_follow(this.handle, tissue.handle));
   }
 

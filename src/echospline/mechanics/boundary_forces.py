@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -206,8 +207,14 @@ class BoundaryForces:
         The parts of the tissue.
     bodies : tuple of Body
         One per part.
+    pieces : tuple of Piece
+        Edges and interfaces with their conditions.
+    order : ndarray of int
+        Unknowns that the least squares keep, best first.
     spacing : float
         Distance between forces outside an edge, mm.
+    weight : float
+        Length that turns a traction into a displacement, over the shear modulus and thickness, mm^2/N.
     residual : Residual
         How well the conditions hold.
 
@@ -230,16 +237,16 @@ class BoundaryForces:
         self.partition, moduli = divide(tissue, grid)
         across = ACROSS if len(moduli) == 1 else ACROSS_REGIONS
         self.spacing = max(short, 2.0 * (x1 - x0 + y1 - y0) / AROUND) / across
-        self.bodies, self._pieces = lay_out(self, moduli, short * INTERFACE)
+        self.bodies, self.pieces = lay_out(self, moduli, short * INTERFACE)
         rigid = {"free": 3, "sliding": 1, "clamped": 0, None: 3}
         self._counts = [2 * len(b.sources) + rigid[b.outside.top] for b in self.bodies]
         self._refuse_large()
         # The softest band, for a traction missed there moves it most; a softer lesion must not outweigh everything else.
-        self._weight = (
+        self.weight = (
             WEIGHT * short / min(b.base.stiffness for b in self.bodies[: len(self.partition.depths) - 1])
         )
-        self._solution = self._decomposed()
-        self._nodes, self._held = self._evaluation(), self._holds(grid.nodes)
+        self._solution, self.order = self._decomposed()
+        self._held = self._holds(grid.nodes)
         self.residual = self._checked()
 
     @property
@@ -261,7 +268,7 @@ class BoundaryForces:
         return mesh, at
 
     @property
-    def _pin(self) -> float:
+    def pin_radius(self) -> float:
         """Radius of the blob whose centre yields to a force as a rigid pin of ``radius`` does, mm.
 
         Far from it both are the same force; at the rim of a pin the mean displacement is (3 - 4 nu) ln(1 / r) + 1 / 2, at the
@@ -269,6 +276,22 @@ class BoundaryForces:
         """
         nu = self.bodies[0].base.nu
         return self.radius * float(np.exp((1.5 - 2.0 * nu) / (3.0 - 4.0 * nu)))
+
+    @property
+    def factors(self) -> tuple[Floats, Floats]:
+        """Factors right (unknowns, rank) and left (rank, rows): strengths are -right left conditions, rows condition by condition.
+
+        At an interface a condition has four rows: displacement along x and y, then traction.
+        """
+        right, left = self._solution
+        order, first = [], 0
+        for piece in self.pieces:
+            n = len(piece.points)
+            rows = np.arange(first, first + (4 if len(piece.bodies) == 2 else 2) * n)
+            order.append(rows.reshape(-1, n, 2).transpose(1, 0, 2).ravel())
+            first += len(rows)
+        order.append(np.arange(first, left.shape[1]))
+        return right, left[:, np.concatenate(order)]
 
     @property
     def nearest(self) -> float:
@@ -329,43 +352,46 @@ class BoundaryForces:
                 f"{self.grid.size} mesh nodes beside interfaces need more than {LARGEST / 1e6:.0f} MB"
             )
 
-    def _decomposed(self) -> tuple[Floats, Floats]:
-        """Least squares of the conditions as two factors: by QR with pivoting, two to three times as fast as singular values."""
+    def _decomposed(self) -> tuple[tuple[Floats, Floats], NDArray[np.intp]]:
+        """Least squares of the conditions as two factors: by QR with pivoting, two to three times as fast as singular values.
+
+        Besides the factors, the unknowns that are kept.
+        """
         Q, R, order = qr(self._conditions(check=False), mode="economic", pivoting=True, check_finite=False)
         size = np.abs(np.diag(R))
         rank = int((size > RANK * size[0]).sum())
         right = np.zeros((R.shape[1], rank))
         right[order[:rank]] = solve_triangular(R[:rank, :rank], np.eye(rank), check_finite=False)
-        return right, np.ascontiguousarray(Q[:, :rank].T)
+        return (right, np.ascontiguousarray(Q[:, :rank].T)), order[:rank]
 
     def _conditions(self, check: bool) -> Floats:
         """What unit strengths do to the conditions, shape (rows, unknowns)."""
         blocks = []
-        for piece in self._pieces:
+        for piece in self.pieces:
             rows = []
             for q in piece.bodies:
                 points, normals = _where(piece, check)
                 u = self._own(q, points) if piece.moves else None
-                t = self._weight * self._own_traction(q, points, normals) if piece.pulls else None
+                t = self.weight * self._own_traction(q, points, normals) if piece.pulls else None
                 rows.append(self._placed(q, _combine(piece, u, t)))
             blocks.append(rows[0] if len(rows) == 1 else rows[0] - rows[1])
         M = np.vstack(blocks)
         pins = self.clamps.points
         if len(pins):
-            M = np.hstack([M, self._loaded(pins, check, self._pin)])
+            M = np.hstack([M, self._loaded(pins, check, self.pin_radius)])
             M = np.vstack([M, PIN * self._columns(pins)])
         return M
 
     def _loaded(self, places: Floats, check: bool = False, radius: float | None = None) -> Floats:
         """What unit forces at places inside the tissue do to the conditions on pieces, shape (rows, 2 m)."""
         blocks, radius = [], radius or self.radius
-        for piece in self._pieces:
+        for piece in self.pieces:
             points, normals = _where(piece, check)
             rows = []
             for q in piece.bodies:
                 base = self.bodies[q].base
                 u = base.displacement(points, places, radius) if piece.moves else None
-                t = self._weight * base.traction(points, normals, places, radius) if piece.pulls else None
+                t = self.weight * base.traction(points, normals, places, radius) if piece.pulls else None
                 rows.append(_combine(piece, u, t))
             blocks.append(rows[0] if len(rows) == 1 else rows[0] - rows[1])
         return np.vstack(blocks)
@@ -426,9 +452,10 @@ class BoundaryForces:
         pins = self.clamps.points
         if not len(pins):
             return G
-        return np.hstack([G, self._base(points, pins, np.eye(2 * len(pins)), self._pin)])
+        return np.hstack([G, self._base(points, pins, np.eye(2 * len(pins)), self.pin_radius)])
 
-    def _evaluation(self) -> _Dense | _Lattice:
+    @cached_property
+    def _nodes(self) -> _Dense | _Lattice:
         """Return what takes strengths to the field at the mesh nodes."""
         if len(self.bodies) > 1:
             return _Dense(self._columns(self.grid.nodes))
@@ -437,7 +464,7 @@ class BoundaryForces:
         if len(x) * len(y) > 0.6 * self.grid.size:
             return _Dense(self._columns(self.grid.nodes))
         pins = self.clamps.points
-        own = self._base(self.grid.nodes, pins, np.eye(2 * len(pins)), self._pin) if len(pins) else None
+        own = self._base(self.grid.nodes, pins, np.eye(2 * len(pins)), self.pin_radius) if len(pins) else None
         lattice = np.stack([a.ravel() for a in np.meshgrid(x, y)], axis=1)
         along = _interpolation(x, self.grid.x), _interpolation(y, self.grid.y)
         return _Lattice(*along, self._own(0, lattice), own)

@@ -6,12 +6,14 @@
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from functools import cached_property
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from echospline.errors import InputError
 from echospline.mechanics.boundary_forces import BoundaryForces, UnsuitedError, inside
+from echospline.mechanics.green_tables import NativeGreen, tables
 from echospline.mechanics.half_plane import HalfPlane
 from echospline.mechanics.landmarks import Clamps
 from echospline.mechanics.quadratic import QuadraticSolve
@@ -56,7 +58,16 @@ class GreenResponse:
 
     def answer(self, places: Floats, forces: Floats, points: Floats) -> tuple[Floats, Floats]:
         """Displacement of the mesh nodes and of points under load cases; see `ForceResponse.answer`."""
-        return self.solver.answer(places, forces, points)
+        return self.native.answer(places, forces, points)
+
+    @cached_property
+    def native(self) -> NativeGreen:
+        """The solver in the core, which answers; `solver` answers the same in NumPy and SciPy."""
+        return NativeGreen(self.solver)
+
+    def tables(self) -> dict[str, Any]:
+        """Return numbers and arrays from which the core answers without Python; see `green_tables.tables`."""
+        return tables(self.solver)
 
     def describe(self) -> str:
         """Return in one sentence which method answers, its residual, and why it was chosen."""

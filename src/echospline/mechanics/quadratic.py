@@ -7,6 +7,7 @@ spread over the same blob as in the closed form, as consistent loads of twelve p
 
 from __future__ import annotations
 
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -47,12 +48,21 @@ class QuadraticSolve:
     radius : float
         Over which a force is spread, mm.
 
+    Attributes
+    ----------
+    x, y : ndarray
+        Lines between the cells, mm.
+    held : ndarray of bool, shape (2 nodes,)
+        Components of the triangles' nodes that do not move.
+    moduli : ndarray, shape (triangles, 2)
+        Lamé parameters times the thickness, N/mm.
+
     Raises
     ------
     InputError
         If a number is out of its range.
     SolverError
-        If the stiffness matrix is singular.
+        By `answer`, if the stiffness matrix is singular.
     """
 
     def __init__(self, grid: RegularGrid, clamps: Clamps, tissue: Tissue, radius: float = 0.4) -> None:
@@ -66,16 +76,24 @@ class QuadraticSolve:
             and not max(tissue.poisson, *(r.poisson for r in tissue.regions), 0) < 0.5
         ):
             raise InputError("Poisson's ratio in plane strain must be below 0.5")
-        self._grid, self.radius = grid, radius
+        self._grid, self.clamps, self.radius = grid, clamps, radius
         self.step = float(np.sqrt((x1 - x0) * (y1 - y0) / CELLS))
         upright, level = straight_interfaces(tissue, grid.extent)
         self.x, self.y = _lines(x0, x1, upright, self.step), _lines(y0, y1, level, self.step)
-        self._nodes = self._located(grid.nodes)
-        self._free = ~self._held(clamps)
-        K = self._stiffness(tissue)
+        self.held = self._holds(clamps)
+        self.moduli = self._lame(tissue)
+
+    @cached_property
+    def _nodes(self) -> Any:
+        return self._located(self.grid.nodes)
+
+    @cached_property
+    def _factors(self) -> Any:
+        free = ~self.held
+        K = self._stiffness()
         try:
-            self._factors = splu(
-                K[self._free][:, self._free].tocsc(),
+            return splu(
+                K[free][:, free].tocsc(),
                 permc_spec="MMD_AT_PLUS_A",
                 diag_pivot_thresh=0.0,
                 options={"SymmetricMode": True},
@@ -96,7 +114,7 @@ class QuadraticSolve:
         u = np.zeros((2 * self._count, k))
         if len(s) and k:
             load = (self._spread(s).T @ f).reshape(2 * self._count, k)
-            u[self._free] = self._factors.solve(np.ascontiguousarray(load[self._free]))
+            u[~self.held] = self._factors.solve(np.ascontiguousarray(load[~self.held]))
         u = u.reshape(self._count, 2 * k)
         mesh, at = self._nodes @ u, self._located(p) @ u
         return mesh.reshape(self.grid.size, 2, k), at.reshape(len(p), 2, k)
@@ -112,7 +130,7 @@ class QuadraticSolve:
     def _count(self) -> int:
         return (2 * len(self.x) - 1) * (2 * len(self.y) - 1)
 
-    def _held(self, clamps: Clamps) -> NDArray[np.bool_]:
+    def _holds(self, clamps: Clamps) -> NDArray[np.bool_]:
         """Which components of which nodes do not move, shape (2 nodes,)."""
         x, y = _with_middles(self.x), _with_middles(self.y)
         held = np.zeros((len(y), len(x), 2), dtype=bool)
@@ -143,13 +161,24 @@ class QuadraticSolve:
             halves.append(first[:, None] + np.array(offsets)[turned.astype(int)])
         return np.stack(halves, axis=1).reshape(-1, 6)
 
-    def _stiffness(self, tissue: Tissue) -> Any:
-        """Assemble the stiffness matrix, N/mm."""
-        triangles = self._triangles()
+    def _corners(self, triangles: NDArray[np.intp]) -> Floats:
         x, y = _with_middles(self.x), _with_middles(self.y)
         places = np.stack([a.ravel() for a in np.meshgrid(x, y)], axis=1)
-        corners = places[triangles[:, :3]]
-        lam, mu = _moduli(tissue, corners)
+        corners: Floats = places[triangles[:, :3]]
+        return corners
+
+    def _lame(self, tissue: Tissue) -> Floats:
+        """Lamé parameters of the triangles times the thickness, N/mm, shape (triangles, 2)."""
+        moduli: Floats = (
+            1e-3 * tissue.thickness * np.stack(_moduli(tissue, self._corners(self._triangles())), axis=1)
+        )
+        return moduli
+
+    def _stiffness(self) -> Any:
+        """Assemble the stiffness matrix, N/mm."""
+        triangles = self._triangles()
+        corners = self._corners(triangles)
+        lam, mu = self.moduli.T
         edges = np.roll(corners, -1, axis=1) - np.roll(corners, 1, axis=1)
         double = (corners[:, 1, 0] - corners[:, 0, 0]) * (corners[:, 2, 1] - corners[:, 0, 1]) - (
             corners[:, 2, 0] - corners[:, 0, 0]
@@ -158,7 +187,7 @@ class QuadraticSolve:
             np.stack([edges[..., 1], -edges[..., 0]], axis=-1) / double[:, None, None]
         )  # of area coordinates
         Ke = np.zeros((len(triangles), 6, 2, 6, 2))
-        weight = 1e-3 * tissue.thickness * np.abs(double) / 6.0
+        weight = np.abs(double) / 6.0
         for q in np.eye(3) / 2 + 1 / 6:  # three points integrate a quadratic exactly
             g = np.matmul(_slopes(q), slope)
             outer = g[:, :, :, None, None] * g[:, None, None, :, :]  # e a i b k

@@ -17,16 +17,21 @@ export class Reel {
     this.last = -Infinity;
   }
 
-  /** @param {number} now ms @param {Uint8ClampedArray} colours RGBA of grey @param {number} columns @param {number} rows @param {DrawCommand[]} list */
-  add(now, colours, columns, rows, list) {
+  /** Keep a picture, at most RATE a second. @param {number} now ms @param {Uint8ClampedArray} colours RGBA of grey @param {number} columns @param {number} rows */
+  add(now, colours, columns, rows) {
     if (now - this.last < 1000 / RATE - 2) return;
     this.last = now;
     const pixels = columns * rows, most = Math.max(2, Math.min(SECONDS * RATE, Math.floor(MOST_BYTES / pixels)));
     const old = this.frames.length >= most ? this.frames.shift() : undefined;
     const kept = old && old.colours.length === pixels ? old.colours : new Uint8Array(pixels);
     for (let k = 0; k < pixels; ++k) kept[k] = colours[4 * k];
-    this.frames.push({ at: now, colours: kept, columns, rows, list });
-    while (this.frames.length && now - this.frames[0].at > 1000 * SECONDS) this.frames.shift();
+    this.frames.push({ at: now, colours: kept, columns, rows, list: [] });
+    while (this.frames.length > 1 && now - this.frames[0].at > 1000 * SECONDS) this.frames.shift();
+  }
+
+  /** What lay over the picture that was just kept. @param {number} now ms @param {DrawCommand[]} list */
+  over(now, list) {
+    if (this.last === now) this.frames[this.frames.length - 1].list = list;
   }
 
   /** Seconds that a clip would last. */

@@ -30,7 +30,7 @@ import { viewOf } from "./view.js";
 const INK = "#e8f1f5", QUIET = "#a9bac5", ACCENT = "#5fd4e0", TARGET = "#ffd166", VESSEL = "#ff7b7b", CALIPER = "#b8f28a", NOTE = "#ffe9b8", EXPERT = "#c9a4ff";
 const STAGES = { dark: { back: "#05070a", quiet: "#a9bac5", rule: "#5b6b77", from: "#27323b", to: "#4a5a66" }, light: { back: "#dfe6ea", quiet: "#45545e", rule: "#7b8b96", from: "#8b9aa5", to: "#5b6b77" } };
 const OUTSIDE = 34; // mm of shaft that is drawn above the skin
-const HUB = 64; // CSS pixels of it, at most
+const HUB_ROOM = 14; // CSS pixels between its end and the top of the stage
 const LOW_TIME = 10; // s left at which the countdown is coloured
 const IN_TISSUE = 0.2; // mm of depth at which the tip has a ring
 
@@ -125,7 +125,7 @@ function expertNeedle(view, { entry, tip }, say) {
 function hub(view, { entry }, { needle }) {
   const [dx, dy] = directionOf(needle.angle), [x, y] = view.toScreen(entry), side = view.flip ? -1 : 1;
   if (y < view.area.top - 1) return [];
-  const length = Math.min(OUTSIDE * view.scale, HUB / Math.max(dy, 0.35));
+  const length = Math.min(OUTSIDE * view.scale, Math.max(16, y - HUB_ROOM) / Math.max(dy, 0.35));
   /** @type {Point} */
   const end = [x - side * dx * length, y - dy * length];
   const [nx, ny] = [dy, -side * dx]; // across the shaft

@@ -45,8 +45,6 @@ export class Engine {
     }, pixels);
     this.columns = image.columns;
     this.rows = image.rows;
-    this.colours = new Uint8ClampedArray(4 * image.columns * image.rows);
-    this.table = new Uint32Array(256);
     /** @type {Solver} */
     this.solver = solverOf(core, pack, this.model);
     this.stale = true; // the picture's deformation is older than the tissue's
@@ -137,10 +135,11 @@ export class Engine {
     return /** @type {Uint8Array} */ (this.picture.draw(inside ? { ...this.pack.needle.echo, entry, tip } : null));
   }
 
-  /** The picture now in colour, (rows, columns, 4). @param {Look} look @returns {Uint8ClampedArray<ArrayBuffer>} */
-  draw(look) {
-    shadeInto(this.colours, this.grey(), this.columns, this.rows, look);
-    return this.colours;
+  /** The picture now in colour, (rows, columns, 4). @param {Look} look @returns {Uint8ClampedArray<ArrayBuffer>} a view, right until the next call into the core */
+  draw({ gain, timeGain, dynamicRange, invert }) {
+    if (this.stale) this.grey();
+    const look = { gain, depth_gains: timeGain, dynamic_range: dynamicRange, recorded_range: RECORDED_RANGE, invert: Number(invert) };
+    return /** @type {Uint8ClampedArray<ArrayBuffer>} */ (this.picture.shade(look));
   }
 
   /** The last deformation's check. */
@@ -183,32 +182,4 @@ function solverOf(core, pack, model) {
 function forcedSolver(core, model, given) {
   void core, given;
   throw new Error(`The core of this page does not know how ${model.label} answers forces.`);
-}
-
-/**
- * Colour of every pixel: grey plus the gain of its row, stretched about white when the dynamic range shrinks.
- * @param {Uint8ClampedArray<ArrayBuffer>} out @param {Uint8Array} grey @param {number} columns @param {number} rows @param {Look} look
- */
-export function shadeInto(out, grey, columns, rows, look) {
-  const words = new Uint32Array(out.buffer), table = new Uint32Array(256), share = RECORDED_RANGE / look.dynamicRange;
-  let last = NaN;
-  for (let row = 0; row < rows; ++row) {
-    const gain = look.gain + timeGainAt(look.timeGain, rows > 1 ? row / (rows - 1) : 0);
-    if (gain !== last) {
-      for (let g = 0; g < 256; ++g) {
-        const level = Math.min(255, Math.max(0, Math.round(255 + (g + (255 * gain) / RECORDED_RANGE - 255) * share)));
-        const shown = look.invert ? 255 - level : level;
-        table[g] = (shown * 0x010101) | 0xff000000;
-      }
-      last = gain;
-    }
-    for (let k = row * columns, end = k + columns; k < end; ++k) words[k] = table[grey[k]];
-  }
-}
-
-/** Time-gain at a share of the depth: linear between sliders. @param {number[]} sliders dB @param {number} share @returns {number} dB */
-export function timeGainAt(sliders, share) {
-  if (sliders.length < 2) return sliders[0] ?? 0;
-  const at = share * (sliders.length - 1), k = Math.min(sliders.length - 2, Math.floor(at));
-  return sliders[k] + (at - k) * (sliders[k + 1] - sliders[k]);
 }

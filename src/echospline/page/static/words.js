@@ -29,7 +29,7 @@ const TABLE = {
   // panels
   "training": ["Training", "Training"], "exercises": ["Exercises", "Übungen"], "trainee": ["Trainee", "Name"], "optional": ["optional", "freiwillig"],
   "start": ["Start", "Start"], "finish": ["Finish", "Fertig"], "start-title": ["Start or finish (E)", "Beginnen oder beenden (E)"],
-  "sessions": ["My attempts", "Meine Versuche"], "sessions-title": ["Attempts kept on this device (L)", "Versuche auf diesem Gerät (L)"],
+  "sessions": ["Attempts", "Versuche"], "sessions-title": ["Attempts kept on this device (L)", "Versuche auf diesem Gerät (L)"],
   "examination": ["Examination", "Prüfung"], "examination-title": ["No rings, no guide, no numbers; every attempt counts", "Keine Ringe, keine Linie, keine Zahlen; jeder Versuch zählt"],
   "entry-rule": ["Entry", "Einstich"], "entry-free": ["free", "frei"], "entry-fixed": ["fixed", "fest"], "entry-drawn": ["drawn by lot", "ausgelost"],
   "model": ["Tissue model", "Gewebemodell"], "image": ["Picture", "Bild"], "needle": ["Needle", "Nadel"], "helps": ["Help", "Hilfen"],

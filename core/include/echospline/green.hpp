@@ -1,0 +1,240 @@
+// Green's function of tissue in the plane: which of two methods answers, and the stations of a needle that it answers.
+#pragma once
+#include "boundary_green.hpp"
+#include "quadratic_green.hpp"
+#include "stick_slip.hpp"
+
+namespace echospline::ECHOSPLINE_CORE {
+
+class Green {
+ public:
+  enum Outcome { done, no_memory, not_held };
+
+  GreenMesh mesh;
+  BoundaryGreen boundary;
+  QuadraticGreen quadratic;
+  bool solves = false;
+
+  Outcome build(const echospline_green_options& o) {
+    mesh.build(o);
+    solves = o.method == ECHOSPLINE_GREEN_SOLVE;
+    if (!solves) return boundary.build(o, mesh) ? done : no_memory;
+    switch (quadratic.build(o, mesh)) {
+      case QuadraticGreen::done: return done;
+      case QuadraticGreen::not_held: return not_held;
+      default: return no_memory;
+    }
+  }
+
+  /// Displacement (.., 2, cases) of mesh nodes and points under load cases; mesh or at may be nullptr. False when memory runs out.
+  bool answer(const double* places, int64_t place_count, const double* forces, int64_t cases, const double* points,
+              int64_t point_count, double* on_mesh, double* at) const {
+    GreenWork work;
+    Array<GreenForce> load[2];
+    Array<double> field;
+    if (!work.reserve(*this) || !load[0].reserve(place_count) || !load[1].reserve(place_count) ||
+        !field.reserve(2 * mesh.nodes()))
+      return false;
+    for (int64_t k = 0; k < cases; k += 2) {
+      const int width = k + 1 < cases ? 2 : 1;
+      for (int w = 0; w < 2; ++w)
+        for (int64_t i = 0; i < place_count; ++i) {
+          const double* f = forces + 2 * i * cases + k + w;
+          load[w][i] = {point_of<2>(places + 2 * i), w < width ? Vec<2>{{f[0], f[cases]}} : Vec<2>{}};
+        }
+      work.solve(*this, load[0].data(), load[1].data(), place_count);
+      for (int w = 0; w < width; ++w) {
+        if (on_mesh) {
+          work.field(*this, w, load[w].data(), place_count, field.data());
+          for (int64_t i = 0; i < 2 * mesh.nodes(); ++i) on_mesh[i * cases + k + w] = field[i];
+        }
+        for (int64_t i = 0; at && i < point_count; ++i) {
+          const Vec<2> u = work.at(*this, w, point_of<2>(points + 2 * i), load[w].data(), place_count);
+          for (int d = 0; d < 2; ++d) at[(2 * i + d) * cases + k + w] = u[d];
+        }
+      }
+    }
+    return true;
+  }
+
+  /// Two solutions, and the room in which they are found.
+  struct GreenWork {
+    Array<double> solution[2];  ///< strengths, or displacement of the triangles' nodes
+    Array<double> load, kept, room;
+
+    bool reserve(const Green& g) {
+      const int64_t numbers = g.solves ? g.quadratic.unknowns() : g.boundary.strengths_room();
+      if (!solution[0].reserve(numbers) || !solution[1].reserve(numbers)) return false;
+      return g.solves ? room.reserve(g.quadratic.solve_room())
+                      : load.reserve(g.boundary.load_room()) && kept.reserve(g.boundary.kept_room()) &&
+                            room.reserve(g.boundary.field_room());
+    }
+    void solve(const Green& g, const GreenForce* a, const GreenForce* b, int64_t count) {
+      for (int w = 0; w < 2; ++w) {
+        const GreenForce* forces = w == 0 ? a : b;
+        double* s = solution[w].data();
+        if (!g.solves) {
+          g.boundary.strengths(forces, count, load.data(), kept.data(), s);
+          continue;
+        }
+        for (int64_t i = 0; i < solution[w].size(); ++i) s[i] = 0;
+        for (int64_t i = 0; i < count; ++i) g.quadratic.add_load(forces[i], s);
+      }
+      if (g.solves) g.quadratic.solve(solution[0].data(), solution[1].data(), room.data());
+    }
+    void field(const Green& g, int w, const GreenForce* forces, int64_t count, double* u) {
+      if (!g.solves) return g.boundary.field(solution[w].data(), forces, count, room.data(), u);
+      for (int64_t i = 0; i < g.mesh.nodes(); ++i) {
+        const Vec<2> v = g.quadratic.at(g.quadratic.at_node(i), solution[w].data());
+        u[2 * i] = v[0], u[2 * i + 1] = v[1];
+      }
+    }
+    Vec<2> at(const Green& g, int w, const Vec<2>& p, const GreenForce* forces, int64_t count) const {
+      return g.solves ? g.quadratic.at(g.quadratic.locate(p), solution[w].data())
+                      : g.boundary.at(p, solution[w].data(), forces, count);
+    }
+  };
+};
+
+/// Answers of a green to the stations of one track: it supplies what a forced tissue asks for.
+class GreenStations {
+ public:
+  const Green* green = nullptr;
+
+  bool attach(const Green* given) {
+    if (given && (!work_.reserve(*given) || !field_.reserve(2 * given->mesh.nodes()) ||
+                  !columns_.reserve(4 * given->mesh.nodes()) || !rows_.reserve(4 * (MOST_STATIONS + 2))))
+      return false;
+    green = given;
+    return true;
+  }
+
+  /// Answer the station that the tissue asks for.
+  SlipTissue::Outcome supply(SlipTissue& tissue) {
+    const int64_t j = tissue.wanted_index, n = green->mesh.nodes();
+    const SlipStation& s = tissue.wanted;
+    for (int64_t i = 0; i < 4 * (j + 1); ++i) rows_[i] = 0;
+    if (s.count == 0) return tissue.answer(nullptr, rows_.data());
+    GreenForce forces[2][4];
+    for (int d = 0; d < 2; ++d) spread(s, {{d == 0 ? 1.0 : 0.0, d == 1 ? 1.0 : 0.0}}, forces[d]);
+    if (!reserve(j)) return SlipTissue::no_memory;
+    work_.solve(*green, forces[0], forces[1], s.count);
+    for (int d = 0; d < 2; ++d) {
+      work_.field(*green, d, forces[d], s.count, field_.data());
+      for (int64_t i = 0; i < 2 * n; ++i) columns_[d * 2 * n + i] = static_cast<float>(field_[i]);
+      const double* solution = work_.solution[d].data();
+      const int64_t numbers = work_.solution[d].size();
+      if (green->solves)
+        for (int64_t i = 0; i < numbers; ++i) solved_[j][d * numbers + i] = static_cast<float>(solution[i]);
+      else
+        for (int64_t i = 0; i < numbers; ++i) strengths_[j][d * numbers + i] = solution[i];
+    }
+    if (!green->solves) {
+      double* mean = mean_[j].data();
+      const int64_t ld = green->boundary.strengths_room();
+      for (int64_t i = 0; i < 2 * ld; ++i) mean[i] = 0;
+      for (int i = 0; i < s.count; ++i) green->boundary.add_columns(s.points[i], s.weights[i], mean, mean + ld);
+    }
+    for (int64_t i = 0; i <= j; ++i)
+      for (int d = 0; d < 2; ++d) {
+        const Vec<2> u = mean_at(i, i == j ? s : tissue.station(i), d, forces[d], s.count);
+        for (int c = 0; c < 2; ++c) rows_[4 * i + 2 * c + d] = u[c];
+      }
+    return tissue.answer(columns_.data(), rows_.data());
+  }
+
+  /// Displacement of points (count, 2) under the tissue's present forces. Every station has been answered.
+  bool displacement_at(const SlipTissue& tissue, const double* points, int64_t count, double* u) const {
+    const int64_t k = tissue.state.count;
+    Array<double> station_force, total;
+    Array<GreenForce> forces;
+    if (!station_force.reserve(2 * k) || !forces.reserve(4 * k)) return false;
+    tissue.forces(station_force.data());
+    int64_t used = 0;
+    if (!green->solves && !total.reserve(green->boundary.strengths_room())) return false;
+    for (int64_t j = 0; j < k; ++j) {
+      const Vec<2> f = point_of<2>(&station_force[2 * j]);
+      const SlipStation& s = tissue.station(j);
+      if ((f[0] == 0 && f[1] == 0) || s.count == 0) {
+        station_force[2 * j] = station_force[2 * j + 1] = 0;
+        continue;
+      }
+      if (green->solves) continue;
+      spread(s, f, &forces[used]), used += s.count;
+      const int64_t numbers = total.size();
+      for (int64_t i = 0; i < numbers; ++i) total[i] += f[0] * strengths_[j][i] + f[1] * strengths_[j][numbers + i];
+    }
+    for (int64_t i = 0; i < count; ++i) {
+      const Vec<2> p = point_of<2>(points + 2 * i);
+      Vec<2> v = {};
+      if (green->solves) {
+        const SixNodes six = green->quadratic.locate(p);
+        for (int64_t j = 0; j < k; ++j)
+          for (int d = 0; d < 2; ++d)
+            if (const double f = station_force[2 * j + d]; f != 0)
+              v = v + f * green->quadratic.at(six, solved_[j].data() + d * green->quadratic.unknowns());
+      } else if (used > 0) {
+        v = green->boundary.at(p, total.data(), forces.data(), used);
+      }
+      u[2 * i] = v[0], u[2 * i + 1] = v[1];
+    }
+    return true;
+  }
+
+ private:
+  Green::GreenWork work_;
+  Array<double> field_, rows_;
+  Array<float> columns_;
+  Array<double> strengths_[MOST_STATIONS + 2];  // boundary: of unit forces along x and y
+  Array<double> mean_[MOST_STATIONS + 2];  // boundary: rows that take strengths to the mean displacement over a station
+  Array<float> solved_[MOST_STATIONS + 2];  // solve: displacement of the triangles' nodes
+
+  static void spread(const SlipStation& s, const Vec<2>& force, GreenForce* out) {
+    for (int i = 0; i < s.count; ++i) out[i] = {s.points[i], s.weights[i] * force};
+  }
+
+  bool reserve(int64_t j) {
+    if (green->solves)
+      return solved_[j].size() == 2 * green->quadratic.unknowns() ||
+             solved_[j].reserve(2 * green->quadratic.unknowns());
+    const int64_t numbers = 2 * green->boundary.strengths_room();
+    return (strengths_[j].size() == numbers || strengths_[j].reserve(numbers)) &&
+           (mean_[j].size() == numbers || mean_[j].reserve(numbers));
+  }
+
+  /// Mean displacement over station i by the unit force that `work_` holds for direction d.
+  Vec<2> mean_at(int64_t i, const SlipStation& s, int d, const GreenForce* forces, int64_t count) const {
+    const double* c = work_.solution[d].data();
+    Vec<2> u = {};
+    if (s.count == 0) return u;
+    if (!green->solves) {
+      const int64_t ld = green->boundary.strengths_room();
+      u = {{dot(mean_[i].data(), c, ld), dot(mean_[i].data() + ld, c, ld)}};
+    }
+    for (int k = 0; k < s.count; ++k)
+      u = u + s.weights[k] * (green->solves ? green->quadratic.at(green->quadratic.locate(s.points[k]), c)
+                                            : green->boundary.closed_at(s.points[k], c, forces, count));
+    return u;
+  }
+};
+
+/// A forced tissue with what answers it, if the host does not.
+struct GreenTissue : SlipTissue {
+  GreenStations stations;
+
+  using SlipTissue::SlipTissue;
+
+  /// Repeat a call as long as it asks for a station that is answered here.
+  template <class Call>
+  Outcome answered_by_green(Call&& call) {
+    Outcome outcome = call();
+    while (outcome == needs_station && stations.green) {
+      outcome = stations.supply(*this);
+      if (outcome != done) return outcome;
+      outcome = call();
+    }
+    return outcome;
+  }
+};
+
+}  // namespace echospline::ECHOSPLINE_CORE
