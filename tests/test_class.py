@@ -6,6 +6,9 @@ import csv
 import http.client
 import io
 import json
+import os
+import shutil
+import subprocess
 import threading
 import time
 from contextlib import contextmanager
@@ -40,6 +43,7 @@ from test_sessions import trace_of
 
 EXERCISE = page_scene.EXERCISE
 CLASS = Criterion()
+NODE = shutil.which("node")
 ANN, BEN = "a" * 64, "b" * 64
 
 
@@ -148,6 +152,20 @@ def test_tables_for_a_spreadsheet_hold_every_attempt_and_no_formula(sessions):
     ]
     assert float(curves[2]["lc_cusum"]) == pytest.approx(CLASS.gain, abs=1e-6)
     assert curves[2]["final_error (mm)"] == "1.2"
+
+
+@pytest.mark.skipif(
+    NODE is None, reason="Node is not installed: the page's reader is not tried on Python's answer"
+)
+def test_the_pages_reader_takes_this_answer(sessions):
+    answer = json.dumps(class_answer(sessions, CLASS))
+    done = subprocess.run(
+        [NODE, "--test", "--test-reporter=tap", "tests/js/page_class.test.js"],
+        cwd=page_scene.ROOT, env={**os.environ, "ECHOSPLINE_CLASS": answer}, capture_output=True, text=True, timeout=60,
+        check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout
+    assert "# skipped 0" in done.stdout
 
 
 # --- over HTTP
