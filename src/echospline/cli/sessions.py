@@ -115,21 +115,8 @@ def import_(
             continue
         sound += not found.differences
         said = _printable("; ".join(found.differences)) or "verified"
-        known = stored.number_of(session.digest)
-        if known is None:
-            made = {
-                "version": session.version, "core": session.core, "pack": session.scene.pack, "attempt": session.attempt,
-                "ended": session.ended,
-                "examination": session.examination, "events": session.events,
-            }  # fmt: skip
-            number = stored.add(
-                session.exercise, found.trace, found.score, trainee=session.trainee, scene=session.scene.title,
-                model=session.model,
-                imported=viewer.Import(session.when, "; ".join(found.differences) or "yes", made, session.digest),
-            )  # fmt: skip
-            print(f"{head}: {said}: stored as {number}")
-        else:
-            print(f"{head}: {said}: stored before as {known}")
+        number, new = viewer.keep(stored, found)
+        print(f"{head}: {said}: stored {'as' if new else 'before as'} {number}")
     print(f"{sound} of {len(given)} sessions verified")
     if sound < len(given):
         raise typer.Exit(1)
@@ -154,7 +141,7 @@ def _shipped(session: page_room.RecordedSession) -> page_room.Pack:
 def rescore(number: Number, kept: Kept = None) -> None:
     """Score a stored session again from its trace, and print both scores as JSON."""
     session, exercise, trace = _open(kept).load(number)
-    print(json.dumps({"stored": session.score, "now": viewer.score(trace, exercise).to_dict()}, indent=2))
+    print(json.dumps({"stored": session.score, "now": page_room.score(trace, exercise).to_dict()}, indent=2))
 
 
 @sessions.command()

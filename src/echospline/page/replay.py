@@ -146,6 +146,8 @@ def verify(pack: Pack, session: RecordedSession) -> Verified:
     said = [*_of_another_exercise(pack, session), *impossible_motion(trace, pack.manifest.needle.fastest)]
     if session.rate != pack.manifest.rate:
         said.append(f"it has {session.rate:g} steps a second, the scene {pack.manifest.rate:g}")
+    if session.planes is not None and pack.dimension == 2:
+        said.append("it moves a probe, and the scene has no probe")
     told = session.score
     if told is None and session.ended != "reset":
         said.append("it carries no score of the page")
