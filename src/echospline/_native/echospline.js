@@ -676,6 +676,7 @@ export class Forced {
 export class Green extends Forced {
   /** @param {Core} core @param {Partial<ForcedOptions>} options @param {GreenTables} tables */
   constructor(core, options, tables) {
+    checkTables(tables);
     const { shape, spacing, origin } = tables;
     const high = [0, 1].map((d) => origin[d] + spacing[d] * (shape[d] - 1));
     super(core, { ...options, node_count: shape[0] * shape[1], low: origin, high }, () => {
@@ -737,12 +738,6 @@ export class Green extends Forced {
 /** Make a response from its tables. @param {Core} core @param {GreenTables} tables @param {number} level @returns {number} handle */
 function createGreen(core, tables, level) {
   const shape = LAYOUTS.echospline_green_options;
-  const known = new Set(shape.fields.map(({ name }) => name));
-  const unknown = Object.keys(tables).filter((name) => !known.has(name));
-  if (unknown.length > 0) {
-    throw new CoreError(Status.WRONG_VALUE, `expected names of echospline_green_options; got ${unknown.join(", ")}`);
-  }
-  checkLengths(tables);
   const at = core.allocate(shape.size);
   /** @type {Record<string, number>} */
   const placed = {};
@@ -752,9 +747,6 @@ function createGreen(core, tables, level) {
     for (const [name, [count, width, type]] of Object.entries(GREEN_TABLES)) {
       const given = /** @type {Numbers | undefined} */ (tables[name]);
       if (given === undefined) continue;
-      if (given.length % width !== 0) {
-        throw new CoreError(Status.WRONG_SIZE, `expected ${width} numbers per entry of ${name}; got ${given.length}`);
-      }
       placed[name] = core.allocate(type.BYTES_PER_ELEMENT * given.length);
       new type(core.buffer, placed[name], given.length).set(given);
       if (count !== "") counts[count] = given.length / width;
@@ -768,22 +760,37 @@ function createGreen(core, tables, level) {
   }
 }
 
-/** Refuse tables that are shorter than others say: the core has no other way to know. @param {GreenTables} tables */
-function checkLengths(tables) {
-  const length = (/** @type {string} */ name) => /** @type {Numbers | undefined} */ (tables[name])?.length ?? 0;
-  const bodies = length("bodies") / 2;
-  const bands = Number(tables.band_count ?? 0);
-  const expected = [
-    ["depths", bodies > 0 ? bands + 1 : 0], ["circles", bodies > 0 ? 3 * (bodies - bands) : 0], ["source_counts", bodies],
-    ["sides", 3 * length("conditions") / 4],
-  ];
-  for (const [name, count] of /** @type {[string, number][]} */ (expected)) {
-    if (length(name) !== count) {
-      throw new CoreError(Status.WRONG_SIZE, `expected ${count} numbers of ${name}; got ${length(name)}`);
+/** Numbers of echospline_green_options that tables name, with their type; pairs are numbers per axis. */
+const GREEN_NUMBERS = Object.freeze(LAYOUTS.echospline_green_options.fields.filter(({ name, kind }) => kind !== "pointer" &&
+  (name === "band_count" || !["struct_size", "level", "reserved", "rank"].includes(name) && !name.endsWith("_count"))));
+
+/** Refuse tables that are no numbers, or shorter than others say: the core has no other way to know. @param {GreenTables} tables */
+function checkTables(tables) {
+  const refuse = (/** @type {number} */ status, /** @type {string} */ text) => {
+    throw new CoreError(status, text);
+  };
+  const known = new Set([...GREEN_NUMBERS.map(({ name }) => name), ...Object.keys(GREEN_TABLES)]);
+  const unknown = Object.keys(tables).filter((name) => !known.has(name));
+  if (unknown.length > 0) refuse(Status.WRONG_VALUE, `expected tables of echospline_green_options; got ${unknown.join(", ")}`);
+  for (const { name, kind, count } of GREEN_NUMBERS) {
+    if (tables[name] === undefined && count === 1) continue;
+    const values = count > 1 ? Array.from(/** @type {any} */ (tables[name] ?? [])) : [tables[name]];
+    const right = kind === "f64" ? Number.isFinite : Number.isSafeInteger;
+    if (values.length !== count || !values.every((value) => right(value))) {
+      refuse(Status.WRONG_VALUE, `expected ${count} ${kind === "f64" ? "finite" : "whole"} number${count > 1 ? "s" : ""} of ${name}; got ${tables[name]}`);
     }
   }
-  for (const name of ["right", "left"]) {
-    if (tables[name] !== undefined) throw new CoreError(Status.WRONG_VALUE, `expected no ${name}: the core finds it`);
+  const length = (/** @type {string} */ name) => /** @type {Numbers | undefined} */ (tables[name])?.length ?? 0;
+  for (const [name, [, width]] of Object.entries(GREEN_TABLES)) {
+    if (tables[name] === undefined || Number.isInteger(length(name) / width) && typeof tables[name] === "object") continue;
+    refuse(Status.WRONG_SIZE, `expected ${width} numbers per entry of ${name}; got ${tables[name]}`.slice(0, 200));
+  }
+  if (tables.method === GreenMethod.GREEN_SOLVE) return;
+  const bodies = length("bodies") / 2;
+  const bands = Number(tables.band_count ?? 0);
+  const expected = { depths: bands + 1, circles: 3 * (bodies - bands), source_counts: bodies, sides: 3 * length("conditions") / 4 };
+  for (const [name, count] of Object.entries(expected)) {
+    if (length(name) !== count) refuse(Status.WRONG_SIZE, `expected ${count} numbers of ${name}; got ${length(name)}`);
   }
 }
 
