@@ -7,6 +7,16 @@ export async function inflated(text) {
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
+/** SHA-256 by the browser, aside; empty where it has none for pages like this. @param {Uint8Array<ArrayBuffer>} bytes @returns {Promise<string>} */
+export async function digest(bytes) {
+  return globalThis.crypto?.subtle ? hexadecimal(new Uint8Array(await crypto.subtle.digest("SHA-256", bytes))) : "";
+}
+
+/** @param {Uint8Array} bytes */
+function hexadecimal(bytes) {
+  return Array.from(bytes, (byte) => byte.toString(16).padStart(2, "0")).join("");
+}
+
 /** Roots of the first primes, as SHA-256 asks for: the first 32 bits of their fractions. @param {number} count @param {number} power */
 function fractions(count, power) {
   const found = [];

@@ -97,6 +97,8 @@ export class Input {
     /** @type {Map<number, Point>} */
     this.pointers = new Map();
     this.mode = "";
+    /** Where the stage was when a press began: to ask costs a layout. */
+    this.box = stage.getBoundingClientRect();
     /** @type {Set<number>} */
     this.padPressed = new Set();
     stage.addEventListener("pointerdown", (event) => this.down(event));
@@ -114,8 +116,8 @@ export class Input {
 
   /** @param {PointerEvent | WheelEvent} event @returns {Point} */
   place(event) {
-    const box = this.stage.getBoundingClientRect();
-    return [event.clientX - box.left, event.clientY - box.top];
+    if (this.pointers.size === 0) this.box = this.stage.getBoundingClientRect();
+    return [event.clientX - this.box.left, event.clientY - this.box.top];
   }
 
   /** @param {PointerEvent} event */

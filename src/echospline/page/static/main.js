@@ -1,10 +1,11 @@
 // The page: one loop at the screen's rate. It steps the tissue, draws when something has changed, and carries out what is asked.
 
-import { inflated, sha256 } from "./bytes.js";
+import { digest, inflated, sha256 } from "./bytes.js";
 import { Reel, download, fileName, newCanvas, pngOf } from "./capture.js";
 import { closableDialogs, openDialog, showAttempts, showCurve, showSummary } from "./dialogs.js";
 import { drawList } from "./draw_list.js";
-import { Engine, poseOf } from "./engine.js";
+import { Engine } from "./engine.js";
+import { Film } from "./film.js";
 import { Input } from "./input.js";
 import { Panels, byId, inputOf, put } from "./panels.js";
 import { Renderer } from "./renderer.js";
@@ -19,7 +20,7 @@ import { LANGUAGES, wordsOf } from "./words.js";
 /** @import { Trace } from "./scoring.js" */
 
 const LONGEST_FRAME = 0.1; // s of model time that one frame makes up for; a slower screen loses time rather than falling behind
-const CHECKPOINT = 240; // rows of a replay between states to go back to
+const PANELS = 50; // ms between changes of the panels, which cost the browser a layout
 const STILL = 0.002; // mm that tissue moves before it is drawn again
 const NOTICE = 5000; // ms
 
@@ -45,10 +46,10 @@ let attempt = null;
 let summed = null;
 /** @type {Session | null} */
 let expert = null;
-/** @type {{ poses: Float64Array, expert: Float64Array | null, row: number, saved: { row: number, state: ReturnType<Engine["save"]> }[] } | null} */
+/** @type {Film | null} */
 let film = null;
 const store = new Store(), reel = new Reel();
-let last = 0, due = 0, halted = false, noticeTimer = 0, attemptNumber = 0;
+let last = 0, due = 0, shownAt = 0, halted = false, noticeTimer = 0, attemptNumber = 0;
 /** @type {State | null} */
 let drawnState = null;
 /** @type {number[]} */
@@ -82,7 +83,10 @@ async function begin() {
     if (!origin.core) origin = { ...origin, core: sha256(coreBytes), pack: sha256(packBytes) };
     return origin;
   };
-  setTimeout(named, 500);
+  setTimeout(async () => {
+    const [core, scene] = await Promise.all([coreBytes, packBytes].map(digest));
+    if (core && scene) origin = { ...origin, core, pack: scene };
+  }, 500);
   requestAnimationFrame(frame);
   await store.open();
 }
@@ -111,6 +115,10 @@ function frame(now) {
     if (state.replay) playOn(dt);
     else if (!state.frozen && !halted) stepOn(dt);
     if (drawnState !== state || hasMoved()) draw(now);
+    if (now - shownAt >= PANELS) {
+      shownAt = now;
+      panels.show(state, attemptNumber);
+    }
   } catch (error) {
     halted = true;
     fault(say("stopped", { reason: messageOf(error) }));
@@ -161,7 +169,7 @@ function draw(now) {
   const pictured = !drawnState || engine.stale || drawnState.look !== state.look;
   const exercise = state.run?.exercise ?? state.replay?.exercise ?? state.exercises.find((one) => one.name === state.chosen);
   const { entry, tip, speed } = engine.pose;
-  live = { ...live, entry, tip, speed, watched: exercise ? watchedNow(landmarksOf(exercise)) : [], expert: expertNow() };
+  live = { ...live, entry, tip, speed, watched: exercise ? watchedNow(landmarksOf(exercise)) : [], expert: film && state.replay ? film.expert() : null };
   if (engine.stale) drawnSamples = samples();
   if (pictured) {
     const colours = engine.draw(state.look);
@@ -171,7 +179,6 @@ function draw(now) {
   const list = drawList(state, live, say);
   renderer.draw(list);
   reel.over(now, list);
-  panels.show(state, attemptNumber);
   drawnState = state;
   Object.assign(byId("stage").dataset, { ready: "true", drawn: String(++counts.drawn), steps: String(counts.steps), depth: Math.hypot(tip[0] - entry[0], tip[1] - entry[1]).toFixed(3), model: state.model });
 }
@@ -249,9 +256,8 @@ function replay(session) {
   if (state.run) finish("reset");
   renew();
   engine.choose(session.model);
-  const poses = posesOf(session), beside = expert && expert !== session ? posesOf(expert) : null;
-  engine.reset([poses[0], poses[1]]);
-  film = { poses, expert: beside, row: 0, saved: [] };
+  const beside = expert && expert !== session ? posesOf(expert) : null;
+  film = new Film(engine, posesOf(session), beside, session.rate);
   act({ do: "replay", replay: { exercise: session.exercise, model: session.model, length: session.steps, events: session.events, expert: beside !== null } });
   panels.events(state, (step) => act({ do: "scrub", at: step }));
   byId("stage").focus({ preventScroll: true });
@@ -261,26 +267,9 @@ function replay(session) {
 function playOn(dt) {
   if (!film || !state.replay) return;
   if (!state.replay.paused) act({ do: "played", rows: dt * state.rate * state.replay.speed });
-  const wanted = Math.floor(state.replay.at);
-  if (wanted < film.row) {
-    const from = film.saved.filter(({ row }) => row <= wanted).pop();
-    if (from) engine.load(from.state);
-    else engine.reset([film.poses[0], film.poses[1]]);
-    film.row = from?.row ?? 0;
-  }
-  for (; film.row < wanted; ++film.row) {
-    if (film.row % CHECKPOINT === 0 && !film.saved.some(({ row }) => row === film?.row)) film.saved.push({ row: film.row, state: engine.save() });
-    engine.take(poseOf(film.poses, film.row, 1 / state.rate));
-  }
-  const { entry, tip } = engine.pose, depth = Math.hypot(tip[0] - entry[0], tip[1] - entry[1]);
-  const angle = depth > 0.01 ? (Math.atan2(tip[1] - entry[1], tip[0] - entry[0]) * 180) / Math.PI : state.needle.angle;
-  if (entry[0] !== state.needle.entry[0] || depth !== state.needle.depth || angle !== state.needle.angle) act({ do: "adopt", needle: { entry: [entry[0], entry[1]], depth, angle } });
-}
-
-/** The expert's needle at this moment of the replay. */
-function expertNow() {
-  if (!film?.expert || !state.replay) return null;
-  return poseOf(film.expert, Math.min(film.expert.length / 5 - 1, Math.max(0, film.row - 1)), 1);
+  film.seek(Math.floor(state.replay.at));
+  const needle = film.needle(state.needle.angle), shown = state.needle;
+  if (needle.entry[0] !== shown.entry[0] || needle.depth !== shown.depth || needle.angle !== shown.angle) act({ do: "adopt", needle });
 }
 
 // --- what is asked
