@@ -91,7 +91,7 @@ def test_live_serves_its_scene_takes_a_session_and_ends_when_told(tmp_path):
             assert process.wait(60) == 0
         assert "Traceback" not in process.stderr.read()
     (kept,) = Sessions(tmp_path / "deep" / "kept.sqlite").newest()
-    assert kept.verified == "yes"
+    assert kept.verified is True
 
 
 def test_a_tracker_that_is_lost_is_said_on_the_page_of_live_with_its_link(tmp_path):

@@ -212,7 +212,7 @@ def opener_for(
 
     def opened(path: Path, spacing: tuple[float, float] | None) -> viewer.Scene:
         values: dict[str, Any] = {"title": "Your image", "image.file": str(path), "image.spacing": spacing, "image.frame": None, "image.window": None,
-                  "image.region": None, "tissue.region": [], "mesh.clamped_points": [], "exercise": []}  # fmt: skip
+                  "image.region": None, "tissue.region": [], "mesh.clamped_points": [], "body": [], "exercise": []}  # fmt: skip
         bare = scenario.with_values(values, "upload")
         io_room.open_recording(path, LARGEST_UPLOAD, whole=False)  # refuses a bomb by its header
         bare, image = bare.opened(path.parent, eight_bit=True)

@@ -10,6 +10,7 @@ if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.page.pack import Pack
     from echospline.page.packing import packed
     from echospline.page.replay import Verified, pack_of_page, replay, verify
+    from echospline.page.rules import beyond, broken_rules
     from echospline.page.scoring import Score, score
     from echospline.page.sessions_file import RecordedSession, parsed_sessions, read_sessions
 else:
@@ -23,6 +24,8 @@ __all__ = [
     "Score",
     "Verified",
     "assembled",
+    "beyond",
+    "broken_rules",
     "bundle",
     "check_exercises",
     "core_bytes",

@@ -10,17 +10,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
-from starlette.requests import HTTPConnection
-
 from echospline.errors import EchosplineError
 from echospline.viewer.aside import Ending, aside
-from echospline.viewer.guard import tokens_of
 from echospline.viewer.hub import Hub
 from echospline.viewer.pictures import Picture
 from echospline.viewer.served_files import ServedFile
 from echospline.viewer.served_scene import Scene, SceneOpener
 from echospline.viewer.sessions import Sessions
-from echospline.viewer.settings import LOOPBACK, Settings
+from echospline.viewer.settings import Settings
 from echospline.viewer.upload import Turns, UploadError, Uploads, ended
 
 log = logging.getLogger(__name__)
@@ -33,7 +30,7 @@ UNUSED_PICTURES = 64
 READ_AT_ONCE, STRAYS = 2, 4
 """Pictures decoded at a time, and decodings beyond their time after which no further one is begun."""
 COMPUTED_AT_ONCE, MOST_WAITING = 2, 64
-"""Sessions run again or followed by finite elements at a time, and those that wait for it."""
+"""Pages that finite elements follow at a time, and those that wait for it."""
 
 
 @dataclass
@@ -59,16 +56,6 @@ class Room:
     def ending(self) -> Ending:
         """Whether the server is ending."""
         return self.uploads.ending
-
-    def teaches(self, connection: HTTPConnection) -> bool:
-        """Test whether a connection is the instructor's: one with the instructor's token, or any of this machine's users where nobody
-        else reaches the server.
-        """
-        secret = self.settings.instructor
-        if secret is not None:
-            return tokens_of(connection.headers).hold(secret)
-        host = connection.client.host if connection.client else ""
-        return host in LOOPBACK and not self.settings.reached_by_others
 
     async def find(self, digest: str) -> Scene | None:
         """Return the scene of a pack, opened again from its stored picture if it is not in memory (after a restart)."""

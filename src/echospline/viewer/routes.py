@@ -12,20 +12,16 @@ from threading import Event
 from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 
-from echospline import page as page_room
 from echospline.errors import EchosplineError, InputError
 from echospline.scene import Floats
 from echospline.viewer import reference
 from echospline.viewer.aside import aside
-from echospline.viewer.recording import keep
+from echospline.viewer.class_routes import Classroom
 from echospline.viewer.room import UNUSED_PICTURES, Room
 from echospline.viewer.served_scene import Scene
 from echospline.viewer.upload import UploadError
 from echospline.viewer.words import for_page
 
-LARGEST_SESSION = 16 * 2**20
-"""Bytes of a session: more than half an hour at 120 steps a second."""
-GONE = "the picture of this session is not here any more: keep the session and export it from the page"
 _KEY = re.compile(r"[0-9a-f]{16,64}")
 _SUFFIX = re.compile(r"(\.[A-Za-z0-9]{1,8}){1,3}$")
 
@@ -53,10 +49,11 @@ async def favicon(_: Request) -> Response:
 async def hello(request: Request) -> Response:
     """Say what this server offers to this page."""
     room = room_of(request)
+    classroom: Classroom = request.app.state.classroom
     return JSONResponse(
         {
             "version": version("echospline"),
-            "instructor": room.teaches(request),
+            "instructor": classroom.instructor.admits(request),
             "fem": room.scene.fem is not None,
             "tracker": room.hub.tracker,
             "uploads": room.opener is not None,
@@ -94,30 +91,6 @@ async def open_picture(request: Request) -> Response:
         await aside(pictures.prune, room.sessions.needs, UNUSED_PICTURES)
     data = await aside(scene.pack.to_bytes)
     return Response(data, media_type="application/octet-stream")
-
-
-async def add_session(request: Request) -> Response:
-    """Run a page's session again, store it, and say whether its numbers are the page's."""
-    room = room_of(request)
-    data = await room.uploads.body(request, LARGEST_SESSION)
-    given = await aside(page_room.parsed_sessions, data, "this session")
-    if len(given) != 1:
-        raise InputError(f"sessions are sent one by one; got {len(given)}")
-    scene = await room.find(given[0].scene.pack)
-    if scene is None:
-        return PlainTextResponse(GONE, 404)
-    found = await room.compute(lambda: aside(page_room.verify, scene.pack, given[0]))
-    number, _ = await aside(lambda: keep(room.sessions, found, source=scene.source, upload=scene.upload))
-    return JSONResponse(
-        {"number": number, "verified": not found.differences, "difference": "; ".join(found.differences)}
-    )
-
-
-async def own_sessions(request: Request) -> Response:
-    """List the sessions of one trainee, newest first."""
-    trainee = request.query_params.get("trainee", "")
-    stored = await aside(room_of(request).sessions.newest, 10_000)
-    return JSONResponse([session.to_dict() for session in stored if session.trainee == trainee])
 
 
 async def fem(request: Request) -> Response:

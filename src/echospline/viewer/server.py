@@ -23,6 +23,7 @@ from echospline.viewer.served_files import ServedFile, core_file, page_file, pho
 from echospline.viewer.served_scene import Scene, SceneOpener
 from echospline.viewer.sessions import Sessions
 from echospline.viewer.settings import LOOPBACK, Settings
+from echospline.viewer.class_routes import Classroom, Instructor, class_routes
 from echospline.viewer.upload import UploadError, Uploads
 
 
@@ -56,6 +57,8 @@ def build_app(
         "pack": ServedFile.of(scene.pack.to_bytes(), "application/octet-stream"),
     }
     room = Room(scene, sessions, settings, Uploads(settings.uploads), files, opener)
+    instructor = Instructor(settings.instructor, alone=not settings.reached_by_others)
+    classroom = Classroom(sessions, room.find, instructor, ending=room.ending)
     sessions.pictures.sweep(sessions.needs)
     outside = {str(urlsplit(origin).hostname) for origin in settings.origins}
     hosts = LOOPBACK | {settings.host} | outside if settings.host in LOOPBACK else None
@@ -68,16 +71,15 @@ def build_app(
             Route("/favicon.ico", routes.favicon),
             Route("/api/hello", routes.hello),
             Route("/api/open", routes.open_picture, methods=["POST"]),
-            Route("/api/sessions", routes.add_session, methods=["POST"]),
-            Route("/api/sessions", routes.own_sessions),
             Route("/api/fem", routes.fem, methods=["POST"]),
             WebSocketRoute("/poses", sockets.poses),
             WebSocketRoute("/phone", sockets.phone),
+            *class_routes(classroom),
         ],
         middleware=[Middleware(Guard, hosts=hosts, tokens=settings.tokens, origins=settings.origins)],
         exception_handlers={InputError: routes.input_error, UploadError: routes.refusal},
     )
-    app.state.room = room
+    app.state.room, app.state.classroom = room, classroom
     return app
 
 
