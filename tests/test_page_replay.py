@@ -347,7 +347,7 @@ def run(*words):
 @pytest.fixture
 def trainer(small, tmp_path):
     path = tmp_path / "trainer.html"
-    path.write_text(assembled(stub, {"core": b"core", "scene": small.to_bytes()}), encoding="utf-8")
+    path.write_text(assembled(stub, {"core": b"core", "scene": small.to_bytes()})[0], encoding="utf-8")
     return path
 
 
@@ -371,16 +371,19 @@ def test_imported_sessions_are_verified_stored_once_listed_and_exported(
     assert "stored before as 1" in capsys.readouterr().out
     stored = Sessions(kept)
     newest = stored.newest()
-    assert [session.verified[:14] for session in newest] == ["final_error is", "yes"]
-    assert newest[1].made["attempt"] == 2
-    assert newest[1].made["pack"] == small.digest
+    assert [(session.verified, session.difference[:14]) for session in newest] == [
+        (False, "final_error is"),
+        (True, ""),
+    ]
+    assert (newest[1].attempt, newest[1].told) == (1, 2)
+    assert newest[1].pack == small.digest
     assert newest[1].started == "2026-03-01T10:20:30+00:00"
     session, exercise, trace = stored.load(1)
     assert score(trace, exercise).to_dict() == session.score
     assert run("export", tmp_path / "all.csv", "--sessions", kept) == 0
     table = (tmp_path / "all.csv").read_text(encoding="utf-8").splitlines()
-    assert table[0].endswith("attempt,verified")
-    assert table[1].endswith("2,yes")
+    assert "attempt,ended,examination,verified" in table[0]
+    assert "1,finished,True,yes" in table[1]
     assert "'=Bob" in table[2]
 
 
@@ -431,6 +434,6 @@ def test_sessions_of_older_schemas_stay_readable_and_take_imports(small, rows, t
     assert run("import", path, "--pack", trainer, "--sessions", kept) == 0
     found = Sessions(kept).newest()
     assert [(one.id, one.trainee, one.verified) for one in found] == [
-        (number + 1, "Ann", "yes"),
-        (number, "Old", ""),
+        (number + 1, "Ann", True),
+        (number, "Old", None),
     ]

@@ -21,7 +21,7 @@ def check_exercises(exercises: Sequence[Exercise], grid: RegularGrid) -> None:
     Raises
     ------
     InputError
-        If two share a name, or a target or vessel lies outside the mesh.
+        If two share a name, or a target, a vessel or an entry lies outside the mesh.
     """
     names = [exercise.name for exercise in exercises]
     for exercise in exercises:
@@ -33,6 +33,20 @@ def check_exercises(exercises: Sequence[Exercise], grid: RegularGrid) -> None:
                 f"exercise {exercise.name!r}: target and vessels must lie in the image, "
                 f"x from {x0:g} to {x1:g} and y from {y0:g} to {y1:g} mm"
             )
+        for entry in _entries(exercise, grid):
+            if not grid.contains(entry).all():
+                x0, x1, y0, y1 = grid.extent
+                raise InputError(
+                    f"exercise {exercise.name!r}: the entry must lie in the image, "
+                    f"x from {x0:g} to {x1:g} and y from {y0:g} to {y1:g} mm; got {entry[0]:g}, {entry[1]:g}"
+                )
+
+
+def _entries(exercise: Exercise, grid: RegularGrid) -> list[tuple[float, float]]:
+    """Return the entries between which an exercise lets its needle begin, mm."""
+    if exercise.entry is not None:
+        return [exercise.entry]
+    return [] if exercise.entry_between is None else [(x, grid.extent[2]) for x in exercise.entry_between]
 
 
 def default_exercises(grid: RegularGrid) -> tuple[Exercise, ...]:

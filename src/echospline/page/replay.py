@@ -13,6 +13,7 @@ import numpy as np
 from echospline.errors import InputError
 from echospline.live import Trace
 from echospline.page.pack import LARGEST, ModelPart, Pack, inflated
+from echospline.page.rules import broken_rules
 from echospline.page.scoring import Score, printed, prints_alike, score
 from echospline.page.sessions_file import RecordedSession
 from echospline.scene import Floats, NeedlePose
@@ -134,7 +135,7 @@ def verify(pack: Pack, session: RecordedSession) -> Verified:
     """Run a session again and say how it differs from what the page said.
 
     Compared are every metric as it is printed, the exercise with that of the pack, the rate, and the motion with the needle's limits:
-    no faster than the pack allows, and with the speed that its poses have.
+    no faster than the pack allows, and with the speed that its poses have, and with the exercise's rules on entry, time and attempts.
 
     Raises
     ------
@@ -143,9 +144,15 @@ def verify(pack: Pack, session: RecordedSession) -> Verified:
     """
     trace = replay(pack, session)
     found = score(trace, session.exercise)
-    said = [*_of_another_exercise(pack, session), *impossible_motion(trace, pack.manifest.needle.fastest)]
+    said = [
+        *_of_another_exercise(pack, session),
+        *impossible_motion(trace, pack.manifest.needle.fastest),
+        *broken_rules(session.exercise, trace, session.attempt),
+    ]
     if session.rate != pack.manifest.rate:
         said.append(f"it has {session.rate:g} steps a second, the scene {pack.manifest.rate:g}")
+    if session.planes is not None and pack.dimension == 2:
+        said.append("it moves a probe, and the scene has no probe")
     told = session.score
     if told is None and session.ended != "reset":
         said.append("it carries no score of the page")

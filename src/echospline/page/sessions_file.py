@@ -85,8 +85,15 @@ class RecordedSession(Table):
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of what was recorded, which names this session wherever it is stored; the score is left out."""
-        told = self.model_dump(mode="json", exclude={"score"})
+        """SHA-256 of what was recorded, which names this session wherever it is stored; the score is left out.
+
+        Values that nobody set are left out too, so that a version that knows more of them gives the same name, and the start is
+        that of `when`, so that a session that was stored and exported again is the same one.
+        """
+        told = {
+            **self.model_dump(mode="json", exclude={"score"}, exclude_defaults=True),
+            "started": self.when,
+        }
         return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
 
     def rows(self, dimension: int) -> Floats:

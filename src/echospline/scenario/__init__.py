@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from echospline.menu import on_demand
 
 if TYPE_CHECKING:  # the menu, loaded on demand
+    from echospline.scenario.body_section import BodySection, bodies_of
     from echospline.scenario.core_models import CoreScene, landmark_scene, landmark_steps
     from echospline.scenario.models import MODELS, build_model
     from echospline.scenario.run import run
@@ -25,10 +26,12 @@ __all__ = [
     "LARGEST_FILE",
     "MODELS",
     "PHANTOM",
+    "BodySection",
     "CoreScene",
     "DiscSection",
     "ExerciseSection",
     "Scenario",
+    "bodies_of",
     "build_model",
     "check",
     "check_store",

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from echospline.errors import InputError
+from echospline.scenario.body_section import bodies_of, body_regions
 from echospline.scenario.scenario import Scenario
 from echospline.scenario.space_section import SpaceSection
 from echospline.scene import Layer, Region, Tissue, Volume
@@ -48,7 +49,7 @@ def open_spatial(scenario: Scenario, folder: Path) -> SpatialScene:
     Raises
     ------
     InputError
-        If it cannot be read or is no volume, or a region of the tissue is one of the plane.
+        If it cannot be read or is no volume, a region of the tissue is one of the plane, or a body cannot be imaged into it.
     """
     space = scenario.space or SpaceSection()
     name = scenario.image.file
@@ -72,12 +73,17 @@ def open_spatial(scenario: Scenario, folder: Path) -> SpatialScene:
         )
     volume, space, said = _windowed(volume, space)
     notes += said
+    if scenario.has_bodies:
+        from echospline.laboratory import imaged_volume  # noqa: PLC0415
+
+        bodies = bodies_of(scenario.body, scenario.exercise)
+        volume = imaged_volume(volume, bodies, display=scenario.phantom.display(), seed=scenario.phantom.seed)
     resolved = scenario.model_copy(update={"space": space})
     return SpatialScene(resolved, volume, spatial_tissue(scenario), tuple(notes))
 
 
 def spatial_tissue(scenario: Scenario) -> Tissue:
-    """Build the tissue in space: homogeneous, or with layers by depth.
+    """Build the tissue in space: homogeneous, or with layers by depth and bodies.
 
     Raises
     ------
@@ -93,6 +99,7 @@ def spatial_tissue(scenario: Scenario) -> Tissue:
                 "and labels build the model in Python"
             )
         regions.append(Region(Layer(*region.layer), region.young, region.poisson, region.name))
+    regions += body_regions(scenario.body, scenario.exercise)
     return Tissue(t.young, t.poisson, regions, t.thickness)
 
 

@@ -11,7 +11,7 @@ import { Panels, byId, inputOf, put } from "./panels.js";
 import { Renderer } from "./renderer.js";
 import { initialState, next, tipOf } from "./state.js";
 import { Store, keepChoices, keptChoices } from "./store.js";
-import { Attempt, fileOf, landmarksOf, posesOf, readSessions } from "./training.js";
+import { Attempt, attemptsLeft, attemptsMade, fileOf, landmarksOf, posesOf, readSessions } from "./training.js";
 import { LANGUAGES, wordsOf } from "./words.js";
 
 /** @import { Live } from "./draw_list.js" */
@@ -186,12 +186,14 @@ function draw(now) {
 // --- training
 
 function start() {
+  const chosen = state.exercises.find((one) => one.name === state.chosen), name = inputOf("trainee").value.trim();
+  if (chosen && !state.run && attemptsLeft(chosen, store.sessions, name) === 0) return notice(say("no-attempts", { count: chosen.attempts ?? 0 }));
   act({ do: "start", lot: Math.random() });
   if (!state.run) return;
   const trainee = inputOf("trainee").value.trim(), { exercise, examination } = state.run;
   renew();
   attempt = new Attempt(exercise, state.rate, state.model, examination, trainee, new Date());
-  attemptNumber = 1 + store.sessions.filter((session) => session.exercise.name === exercise.name && session.trainee === trainee).length;
+  attemptNumber = 1 + attemptsMade(store.sessions, exercise.name, trainee);
   drawnState = null;
 }
 

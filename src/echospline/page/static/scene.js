@@ -13,9 +13,10 @@ const ARRAY_TYPES = { uint8: Uint8Array, float32: Float32Array, float64: Float64
 /** @typedef {[number, number]} Point (x lateral, y depth), mm */
 /** @typedef {{ centre: number[], radius: number }} Ball round structure, a disc in the plane; mm */
 /**
+ * `help` false takes rings, guide and readouts away; `entry` is where the needle enters, `entry_between` where it is drawn by lot (mm); `attempts` a trainee has.
  * @typedef {{
  *   name: string, title: string, goal: string, target: Ball, vessels: Ball[], most_redirections: number | null, time_limit: number,
- *   [extra: string]: any
+ *   help: boolean, entry: number[] | null, entry_between: number[] | null, attempts: number | null, [extra: string]: any
  * }} Exercise
  */
 /**
@@ -88,11 +89,15 @@ export function readExercise(value, what, dimension) {
     const b = asRecord(at, name);
     return { centre: asNumbers(b.centre, `${name}.centre`, dimension), radius: asNumber(b.radius, `${name}.radius`, 1e-6, 100) };
   };
-  const most = entry.most_redirections ?? null;
+  const most = entry.most_redirections ?? null, attempts = entry.attempts ?? null, help = entry.help ?? true;
+  if (typeof help !== "boolean") throw new PackError(`Expected true or false for ${what}.help; got ${shown(help)}.`);
+  const place = entry.entry ?? null, between = entry.entry_between ?? null;
   return {
     ...entry, name: asText(entry.name, `${what}.name`, 80), title: asText(entry.title, `${what}.title`, 80), goal: asText(entry.goal ?? "", `${what}.goal`, 400),
     target: ball(entry.target, `${what}.target`), vessels: asList(entry.vessels ?? [], `${what}.vessels`, 0, MOST_VESSELS).map((v, j) => ball(v, `${what}.vessels[${j}]`)),
     most_redirections: most === null ? null : asNumber(most, `${what}.most_redirections`, 0, 1e6), time_limit: asNumber(entry.time_limit ?? 120, `${what}.time_limit`, 0.01, 1800),
+    help, entry: place === null ? null : asNumbers(place, `${what}.entry`, dimension), entry_between: between === null ? null : asNumbers(between, `${what}.entry_between`, 2),
+    attempts: attempts === null ? null : asWhole(attempts, `${what}.attempts`, 1, 1000),
   };
 }
 

@@ -221,7 +221,8 @@ function started(state, lot) {
   const exercise = state.exercises.find((one) => one.name === state.chosen);
   if (!exercise || state.run) return state;
   const { x0, x1, y0 } = state.extent, rule = state.examination ? state.entryRule : "free";
-  const given = exercise.entry ?? (rule === "fixed" ? state.home.entry : rule === "drawn" ? [x0 + (0.15 + 0.7 * lot) * (x1 - x0), y0] : null);
+  const span = exercise.entry_between ?? (rule === "drawn" ? [x0 + 0.15 * (x1 - x0), x0 + 0.85 * (x1 - x0)] : null);
+  const given = exercise.entry ?? (span ? [span[0] + lot * (span[1] - span[0]), y0] : rule === "fixed" ? state.home.entry : null);
   const needle = { ...state.needle, depth: 0, entry: given ? /** @type {Point} */ ([given[0], given[1]]) : state.needle.entry };
   return {
     ...state, needle, frozen: false, replay: null, touched: true, calipers: [], notes: [], drawing: null, cursor: null, tool: "needle",

@@ -164,6 +164,17 @@ function readScore(value, what) {
   };
 }
 
+/** Attempts of a trainee at an exercise so far: as many as are kept, or the highest number among them. @param {Session[]} sessions @param {string} exercise @param {string} trainee */
+export function attemptsMade(sessions, exercise, trainee) {
+  const own = sessions.filter((session) => session.exercise.name === exercise && session.trainee === trainee);
+  return own.reduce((most, session) => Math.max(most, session.attempt), own.length);
+}
+
+/** Attempts that a trainee has left; null where there is no limit. @param {Exercise} exercise @param {Session[]} sessions @param {string} trainee */
+export function attemptsLeft(exercise, sessions, trainee) {
+  return exercise.attempts === null ? null : Math.max(0, exercise.attempts - attemptsMade(sessions, exercise.name, trainee));
+}
+
 /** A file of sessions. @param {Session[]} sessions */
 export function fileOf(sessions) {
   return JSON.stringify({ format: 1, kind: SEVERAL, sessions });

@@ -39,6 +39,7 @@ const TABLE = {
   "guide": ["Guide line", "Führungslinie"], "rings": ["Rings", "Ringe"], "readouts": ["Numbers", "Zahlen"],
   // messages
   "model-kept": ["The model stays as it is while an attempt is recorded.", "Während ein Versuch läuft, bleibt das Modell."],
+  "no-attempts": ["This exercise has {count} attempts, and all of them are made.", "Diese Übung hat {count} Versuche, und alle sind gemacht."],
   "recording": ["Attempt {attempt}: {title}", "Versuch {attempt}: {title}"], "replaying": ["Replay: {title}", "Wiedergabe: {title}"],
   "stored": ["Attempt kept.", "Versuch gespeichert."], "not-stored": ["This browser keeps nothing for pages like this ({reason}): attempts last until the page is closed. Export them.", "Dieser Browser bewahrt für solche Seiten nichts auf ({reason}): Versuche bleiben, bis die Seite geschlossen wird. Exportiere sie."],
   "stopped": ["The model stopped: {reason} Reset starts it again.", "Das Modell hielt an: {reason} Zurück startet es neu."],
