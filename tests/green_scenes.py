@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import ctypes
 from typing import Any
 
 import numpy as np
 
 from echospline import _native
-from echospline._native import green as core
-from echospline.mechanics import Clamps, NeedleForces
+from echospline.mechanics import Clamps, ForcedScene, ForcedStep, NeedleLoad
 from echospline.mechanics.green_response import green_response
-from echospline.mechanics.green_tables import options_of
 from echospline.scene import Circle, Layer, NeedlePose, Polygon, RegularGrid, Tissue
 from echospline.scene.tissue import Region
 
@@ -57,60 +54,26 @@ def session() -> list[tuple[NeedlePose, float]]:
 
 
 class Attached:
-    """A forced tissue of the core with a green made from tables alone, as any host makes it."""
+    """A forced tissue of the core with a green made from tables alone, which goes on from one state to the next."""
 
-    def __init__(self, tables: dict[str, Any], law: NeedleForces | None = None) -> None:
-        self.core, law = core.library(), law or NeedleForces()
-        self.green, self.forced = ctypes.c_void_p(), ctypes.c_void_p()
-        options, self.kept = options_of(tables)
-        self.nodes = tables["shape"][0] * tables["shape"][1]
-        status = self.core.echospline_green_create(ctypes.byref(options), ctypes.byref(self.green))
-        _native.check(status, self.core.echospline_green_message, self.green)
-        o = _native.ForcedOptions(struct_size=ctypes.sizeof(_native.ForcedOptions), node_count=self.nodes)
-        for name in ("tip", "friction_limit", "bond", "tip_stiffness", "side_stiffness", "viscosity", "station_spacing",
-                     "substep", "dead_band"):  # fmt: skip
-            setattr(o, name, getattr(law, name))
-        for d in (0, 1):
-            o.low[d] = tables["origin"][d]
-            o.high[d] = tables["origin"][d] + tables["spacing"][d] * (tables["shape"][d] - 1)
-        self.check(self.core.echospline_forced_create(ctypes.byref(o), ctypes.byref(self.forced)))
-        self.check(self.core.echospline_forced_attach(self.forced, self.green))
+    def __init__(self, tables: dict[str, Any]) -> None:
+        arrays = {name: table for name, table in tables.items() if isinstance(table, np.ndarray)}
+        numbers = {name: value for name, value in tables.items() if name not in arrays}
+        self.step = ForcedStep(ForcedScene({}, numbers, arrays))
+        self.core, self.forced, self.green = self.step._core, self.step._forced, self.step._green
+        self.state = self.step.rest()
 
     def check(self, status: int) -> None:
         _native.check(status, self.core.echospline_forced_message, self.forced)
 
     def advance(self, pose: NeedlePose, dt: float) -> None:
-        p = _native.Pose(dt=dt, speed=pose.speed)
-        p.entry[0], p.entry[1] = pose.entry
-        p.tip[0], p.tip[1] = pose.tip
-        self.check(self.core.echospline_forced_advance(self.forced, ctypes.byref(p)))
+        self.state = self.step.advance(self.state, pose, dt)
 
     def displacement(self) -> np.ndarray:
-        u = np.empty((self.nodes, 2))
-        self.check(self.core.echospline_forced_displacement(self.forced, u.ctypes.data, u.size))
-        return u
+        return self.step.displacement(self.state)
 
     def displacement_at(self, points: np.ndarray) -> np.ndarray:
-        p = np.ascontiguousarray(points, dtype=np.float64)
-        u = np.empty_like(p)
-        self.check(
-            self.core.echospline_forced_displacement_at(self.forced, p.ctypes.data, len(p), u.ctypes.data)
-        )
-        return u
+        return self.step.displacement_at(self.state, points)
 
-    def load(self) -> _native.NeedleLoad:
-        load = _native.NeedleLoad()
-        self.check(self.core.echospline_forced_load(self.forced, ctypes.byref(load)))
-        return load
-
-    def save(self) -> bytes:
-        saved = ctypes.create_string_buffer(self.core.echospline_forced_state_size(self.forced))
-        self.check(self.core.echospline_forced_state_save(self.forced, saved, len(saved)))
-        return saved.raw
-
-    def restore(self, saved: bytes) -> None:
-        self.check(self.core.echospline_forced_state_load(self.forced, saved, len(saved)))
-
-    def __del__(self) -> None:
-        self.core.echospline_forced_destroy(self.forced)
-        self.core.echospline_green_destroy(self.green)
+    def load(self) -> NeedleLoad:
+        return self.step.load(self.state)

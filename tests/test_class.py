@@ -182,7 +182,11 @@ def served(path, pack, *, token=None, instructor=None, alone=False):
     app = Starlette(
         routes=class_routes(classroom),
         middleware=[
-            Middleware(Guard, hosts=frozenset({"127.0.0.1"}), token=token, instructor=instructor),
+            Middleware(
+                Guard,
+                hosts=frozenset({"127.0.0.1"}),
+                tokens=tuple(t for t in (token, instructor) if t and token),
+            ),
         ],
     )
     server = uvicorn.Server(uvicorn.Config(app, port=0, log_level="error"))

@@ -13,25 +13,29 @@ import sys
 import tomllib
 import zlib
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
 from echospline import _native
-from echospline._native import space as SPACE  # noqa: N812
+from echospline._native import green
 
 ROOT = Path(__file__).resolve().parent.parent
 CORE = ROOT / "core"
 sys.path.insert(0, str(CORE))
 import build  # noqa: E402
 
+
+def plain(*headers: str) -> str:
+    """Headers of the C interface without comments."""
+    texts = [(CORE / "include" / "echospline" / name).read_text(encoding="utf-8") for name in headers]
+    return "".join(re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL) for text in texts)
+
+
 HEADER = (CORE / "include" / "echospline" / "echospline.h").read_text(encoding="utf-8")
-PLAIN = re.sub(r"/\*.*?\*/", "", HEADER, flags=re.DOTALL)
-BOTH = PLAIN + re.sub(
-    r"/\*.*?\*/",
-    "",
-    (CORE / "include" / "echospline" / "space.h").read_text(encoding="utf-8"),
-    flags=re.DOTALL,
-)  # what JavaScript has
+PLAIN = plain("echospline.h")
+BINDINGS = {"echospline.h": _native, "green.h": green}
+ALL = plain("echospline.h", "green.h", "space.h")  # what JavaScript has
 WASM = ROOT / "src" / "echospline" / "_native" / "echospline.wasm"
 JAVASCRIPT = WASM.with_suffix(".js").read_text(encoding="utf-8")
 CC = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
@@ -68,17 +72,17 @@ def header_structs(text: str = PLAIN) -> dict[str, list[str]]:
     return structs
 
 
-def binding_structs() -> dict[str, type[ctypes.Structure]]:
-    mirrors = (value for value in vars(_native).values() if isinstance(value, type))
+def binding_structs(binding: ModuleType) -> dict[str, type[ctypes.Structure]]:
+    mirrors = (value for value in vars(binding).values() if isinstance(value, type))
     return {
         str(mirror.__doc__).rstrip("."): mirror for mirror in mirrors if issubclass(mirror, ctypes.Structure)
     }
 
 
-def layout_program() -> str:
+def layout_program(header: str) -> str:
     """C that prints {struct: {size, offsets}} as JSON."""
     lines = []
-    for name, members in header_structs().items():
+    for name, members in header_structs(plain(header)).items():
         lines.append(
             f'printf("%s\\"{name}\\": {{\\"size\\": %zu, \\"offsets\\": {{", comma, sizeof({name}));'
         )
@@ -89,31 +93,37 @@ def layout_program() -> str:
         lines.append('printf("}}"); comma = ", ";')
     body = "\n  ".join(lines)
     return (
-        '#include "echospline/echospline.h"\n#include <stddef.h>\n#include <stdio.h>\n'
+        f'#include "echospline/{header}"\n#include <stddef.h>\n#include <stdio.h>\n'
         f'int main(void) {{\n  const char* comma = "";\n  printf("{{");\n  {body}\n  printf("}}");\n  return 0;\n}}\n'
     )
 
 
-def test_the_binding_declares_every_function_of_the_header():
-    assert {name: len(arguments) for name, (_, arguments) in _native.FUNCTIONS.items()} == declared()
+@pytest.mark.parametrize("header", BINDINGS)
+def test_the_binding_declares_every_function_of_the_header(header):
+    functions = BINDINGS[header].FUNCTIONS
+    assert {name: len(arguments) for name, (_, arguments) in functions.items()} == declared(plain(header))
 
 
-def test_the_binding_has_every_enum_value_of_the_header():
-    enums = [value for value in vars(_native).values() if isinstance(value, type) and issubclass(value, int)]
+@pytest.mark.parametrize("header", BINDINGS)
+def test_the_binding_has_every_enum_value_of_the_header(header):
+    binding = BINDINGS[header]
+    enums = [value for value in vars(binding).values() if isinstance(value, type) and issubclass(value, int)]
     values = {
-        member.name: int(member) for enum in enums for member in enum if "echospline" in enum.__module__
+        member.name: int(member) for enum in enums for member in enum if enum.__module__ == binding.__name__
     }
-    assert values == header_enums()
+    assert values == header_enums(plain(header))
 
 
 @needs_compiler
-def test_the_bindings_structs_are_laid_out_as_the_compiler_lays_them_out(tmp_path):
+@pytest.mark.parametrize("header", BINDINGS)
+def test_the_bindings_structs_are_laid_out_as_the_compiler_lays_them_out(header, tmp_path):
     source, program = tmp_path / "layout.c", tmp_path / "layout"
-    source.write_text(layout_program())
+    source.write_text(layout_program(header))
     subprocess.run([CC, "-I", CORE / "include", source, "-o", program], check=True)
     layouts = json.loads(subprocess.run([program], capture_output=True, check=True).stdout)
-    assert set(layouts) == set(binding_structs())
-    for name, mirror in binding_structs().items():
+    mirrors = binding_structs(BINDINGS[header])
+    assert set(layouts) == set(mirrors)
+    for name, mirror in mirrors.items():
         offsets = {field[0]: getattr(mirror, field[0]).offset for field in mirror._fields_}
         assert {"size": ctypes.sizeof(mirror), "offsets": offsets} == layouts[name]
 
@@ -186,7 +196,7 @@ def test_the_level_is_what_the_processor_has():
 def test_only_the_interface_is_exported():
     path = Path(_native.__file__).parent / _native.FILE
     lines = subprocess.run(["nm", "-D", "--defined-only", path], capture_output=True, text=True, check=True)
-    assert {line.split()[-1] for line in lines.stdout.splitlines()} == set(declared()) | set(SPACE.FUNCTIONS)
+    assert {line.split()[-1] for line in lines.stdout.splitlines()} == set(declared(ALL))
 
 
 @needs_elf
@@ -216,15 +226,15 @@ def test_webassembly_is_small_and_needs_nothing():
     build.check_wasm(WASM)
     assert len(zlib.compress(WASM.read_bytes(), 9)) < 200_000  # as a page packs it, both precisions included
     names = set(re.findall(rb"echospline_\w+", WASM.read_bytes()))
-    assert {name.encode() for name in declared(BOTH)} <= names
+    assert {name.encode() for name in declared(ALL)} <= names
 
 
 def test_javascript_calls_functions_of_the_header_alone():
-    names = set(re.findall(r"\b(echospline_\w+)\(", JAVASCRIPT)) - set(header_structs(BOTH))
-    assert names <= set(declared(BOTH))
+    names = set(re.findall(r"\b(echospline_\w+)\(", JAVASCRIPT)) - set(header_structs(ALL))
+    assert names <= set(declared(ALL))
     called_by_name = {
         f"echospline_{what}_{verb}"
-        for what in ("scene", "tissue", "picture", "forced", "volume")
+        for what in ("scene", "tissue", "picture", "forced", "volume", "green")
         for verb in ("create", "message")
     }
     called_by_name |= {"echospline_scene_destroy", "echospline_tissue_destroy"}
@@ -233,19 +243,19 @@ def test_javascript_calls_functions_of_the_header_alone():
         "echospline_picture_deform",
         "echospline_picture_deform_single",
     }
-    assert set(declared(BOTH)) - names - called_by_name - not_needed == set()
+    assert set(declared(ALL)) - names - called_by_name - not_needed == set()
 
 
 @pytest.mark.skipif(NODE is None or build.zig() is None, reason="Node or ziglang is not installed")
 def test_javascripts_structs_are_laid_out_as_the_compiler_lays_them_out(tmp_path):
     numbers = [
         f"sizeof({name})" if member is None else f"offsetof({name}, {member})"
-        for name, members in header_structs(BOTH).items()
+        for name, members in header_structs(ALL).items()
         for member in (None, *members)
     ]
     source, module, layouts = tmp_path / "layout.c", tmp_path / "layout.wasm", tmp_path / "layouts.json"
     source.write_text(
-        '#include "echospline/space.h"\n#include <stddef.h>\n'
+        '#include "echospline/green.h"\n#include "echospline/space.h"\n#include <stddef.h>\n'
         f"const int numbers[] = {{{', '.join(numbers)}}};\nint number(int i) {{ return numbers[i]; }}\n"
     )
     command = [
@@ -270,7 +280,7 @@ def test_javascripts_structs_are_laid_out_as_the_compiler_lays_them_out(tmp_path
     values = iter(json.loads(run.stdout))
     result = {
         name: {"size": next(values), "offsets": {member: next(values) for member in members}}
-        for name, members in header_structs(BOTH).items()
+        for name, members in header_structs(ALL).items()
     }
     layouts.write_text(json.dumps(result))
     done = subprocess.run(
@@ -287,4 +297,4 @@ def test_javascripts_structs_are_laid_out_as_the_compiler_lays_them_out(tmp_path
 def test_javascript_has_every_enum_value_of_the_header():
     blocks = re.findall(r"Object\.freeze\(\{([^{}\[\]]*)\}\)", JAVASCRIPT)
     values = {name: int(value) for block in blocks for name, value in re.findall(r"(\w+): (\d+)", block)}
-    assert values == header_enums(BOTH)
+    assert values == header_enums(ALL)

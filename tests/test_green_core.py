@@ -17,7 +17,7 @@ import pytest
 from echospline import _native
 from echospline._native import green as core
 from echospline.errors import InputError, SolverError
-from echospline.mechanics import ForceModel
+from echospline.mechanics import ForcedScene, ForceModel
 from echospline.mechanics.green_tables import NativeGreen, options_of
 from echospline.scene import RegularGrid
 from green_scenes import GRID, SCENES, Attached, made, session
@@ -90,7 +90,7 @@ def test_a_saved_state_goes_on_in_another_tissue(name):
     one, other, path = Attached(tables), Attached(tables), session()
     for pose, dt in path[:60]:
         one.advance(pose, dt)
-    other.restore(one.save())
+    other.state = one.state
     np.testing.assert_array_equal(other.displacement_at(POINTS), one.displacement_at(POINTS))
     for pose, dt in path[60:]:
         one.advance(pose, dt)
@@ -135,6 +135,14 @@ WRONG = {
     "a point outside": ("clamped points", {"pins": np.array([[50.0, 3.0]])}, "pins must lie in the tissue"),
     "lines": ("polygon", {"lines_x": np.array([0.0, 3.0, 2.0, 40.0])}, "must ascend"),
     "fewer moduli": ("polygon", {"moduli": np.ones((4, 2))}, "triangles"),
+    "fewer sides": ("lesion", {"sides": np.zeros((4, 3), dtype=np.int32)}, "sides of green must have"),
+    "fewer source counts": ("lesion", {"source_counts": np.array([9])}, "source_counts of green must have"),
+    "half an entry": ("lesion", {"sources": np.ones(7)}, "2 per entry"),
+    "no whole numbers": ("lesion", {"order": np.array([0.5])}, "whole numbers"),
+    "a name that is none": ("lesion", {"wonder": 3}, "'wonder' is no table of green"),
+    "factors": ("lesion", {"left": np.ones(4)}, "'left' is no table"),
+    "another form": ("lesion", {"spacing": [1.0]}, "spacing of green has another form"),
+    "more bodies than the arrays": ("lesion", {"band_count": 1 << 40}, "must have"),
 }
 
 
@@ -143,6 +151,13 @@ def test_wrong_tables_are_refused_in_one_sentence(case):
     name, changed, message = WRONG[case]
     with pytest.raises(InputError, match=message):
         Attached(made(name).tables() | changed)
+
+
+@pytest.mark.parametrize("options", [{"node_count": 4.0}, {"tip": "1"}, {"tip": True}])
+def test_a_scene_takes_parameters_of_the_law_alone(options):
+    scene = ForcedScene.of(made("lesion"))
+    with pytest.raises(InputError, match="of a forced tissue"):
+        ForcedScene(options, scene.response, scene.arrays)
 
 
 def test_tissue_that_is_not_held_is_refused():

@@ -228,7 +228,7 @@ def test_packed_data_that_unpacks_without_end_is_refused():
 
 
 def test_a_page_holds_its_scene_and_gives_it_back(small, tmp_path):
-    page = assembled(stub, {"core": b"core", "scene": small.to_bytes()})
+    page = assembled(stub, {"core": b"core", "scene": small.to_bytes()})[0]
     (tmp_path / "page.html").write_text(page, encoding="utf-8")
     assert pack_of_page(tmp_path / "page.html").digest == small.digest
     assert "onerror" not in page
@@ -236,7 +236,7 @@ def test_a_page_holds_its_scene_and_gives_it_back(small, tmp_path):
 
 
 def test_the_policy_names_the_very_bytes_of_script_and_style(small):
-    page = assembled(stub, {"core": b"core", "scene": small.to_bytes()}, "de")
+    page = assembled(stub, {"core": b"core", "scene": small.to_bytes()}, "de")[0]
     content = re.search(r'<meta http-equiv="Content-Security-Policy" content="([^"]*)">', page).group(1)
     script = re.search(r'<script type="module">(.*?)</script>', page, re.DOTALL).group(1)
     style = re.search(r"<style>(.*?)</style>", page, re.DOTALL).group(1)
@@ -252,8 +252,8 @@ def test_the_policy_names_the_very_bytes_of_script_and_style(small):
 
 
 def test_line_ends_of_a_checkout_make_no_difference(small):
-    windows = assembled(lambda name: stub(name).replace("\n", "\r\n"), {"scene": small.to_bytes()})
-    assert windows == assembled(stub, {"scene": small.to_bytes()})
+    windows = assembled(lambda name: stub(name).replace("\n", "\r\n"), {"scene": small.to_bytes()})[0]
+    assert windows == assembled(stub, {"scene": small.to_bytes()})[0]
 
 
 MODULES = {
@@ -315,7 +315,7 @@ def test_a_page_opens_from_a_file_and_runs_nothing_that_was_added(small, tmp_pat
     wasm = page_scene.ROOT / "src" / "echospline" / "_native" / "echospline.wasm"
     if not wasm.exists():
         pytest.skip("echospline.wasm is not built; run make wasm")
-    page = assembled(stub, {"core": wasm.read_bytes(), "scene": small.to_bytes()})
+    page = assembled(stub, {"core": wasm.read_bytes(), "scene": small.to_bytes()})[0]
     heard = []
 
     class Listener(BaseHTTPRequestHandler):

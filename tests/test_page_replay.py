@@ -347,7 +347,7 @@ def run(*words):
 @pytest.fixture
 def trainer(small, tmp_path):
     path = tmp_path / "trainer.html"
-    path.write_text(assembled(stub, {"core": b"core", "scene": small.to_bytes()}), encoding="utf-8")
+    path.write_text(assembled(stub, {"core": b"core", "scene": small.to_bytes()})[0], encoding="utf-8")
     return path
 
 

@@ -11,12 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from echospline.mechanics import NeedleForces, SpatialForceModel
 from echospline.mechanics.landmarks import SIDES
 from echospline.mechanics.space_response import SpaceResponse, block
 from echospline.picture import NeedleEcho
 from echospline.picture.slices import STEP, SliceDrawing
 from echospline.scene import Probe, SpatialPose, Tissue, probe_plane
 from test_slices import smooth_volume
+from test_spatial_core import session
 
 ROOT = Path(__file__).resolve().parent.parent
 NODE = shutil.which("node")
@@ -104,3 +106,28 @@ def test_webassembly_draws_planes_as_python_does(tmp_path):
     path = tmp_path / "scene.json"
     path.write_text(json.dumps(scene), encoding="utf-8")
     run("space.test.js", ECHOSPLINE_SPACE_SCENE=str(path))
+
+
+def test_webassembly_steps_the_law_as_python_does(tmp_path):
+    faces = {"left": "clamped", "right": "clamped", "bottom": "clamped", "front": "sliding", "back": "free", "top": "sliding"}
+    grid, clamps = block((36.0, 32.0, 30.0), faces)
+    response = SpaceResponse(grid, clamps, Tissue(10.0, 0.45), radius=1.5)
+    model, points = SpatialForceModel(response, NeedleForces()), np.array([[-4.0, 7.0, -1.0], [5.0, 3.0, 3.0]])
+    state, states = model.rest(), []
+    for pose in session():
+        state = model.advance(state, pose, 0.1)
+        load = {name: getattr(state.load, name) for name in ("tip", "friction", "side", "cut")}
+        states.append({
+            "forces": state.forces.ravel().tolist(),
+            "load": {**load, "force": state.force.tolist(), "torque": state.torque.tolist()},
+            "displacement": model.field(state)(points).ravel().tolist(),
+        })  # fmt: skip
+    given = {
+        "tables": {name: np.asarray(value).tolist() for name, value in response.tables().items()},
+        "poses": [[list(pose.entry), list(pose.tip)] for pose in session()],
+        "points": points.ravel().tolist(),
+        "states": states,
+    }
+    path = tmp_path / "session.json"
+    path.write_text(json.dumps(given), encoding="utf-8")
+    run("spatial.test.js", ECHOSPLINE_SPATIAL=str(path))

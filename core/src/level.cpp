@@ -4,6 +4,7 @@
 #include "green_level.hpp"
 #include "picture_level.hpp"
 #include "space_level.hpp"
+#include "spatial_level.hpp"
 #include "tissue_level.hpp"
 
 #define ECHOSPLINE_JOIN2(a, b) a##b
@@ -21,5 +22,5 @@ extern const echospline::Level ECHOSPLINE_JOIN(echospline_level_, ECHOSPLINE_LEV
 const echospline::Level ECHOSPLINE_JOIN(echospline_level_, ECHOSPLINE_LEVEL) = {
     ECHOSPLINE_LEVEL, &echospline::ECHOSPLINE_CORE::tissue_entries, &echospline::ECHOSPLINE_CORE::picture_entries,
     &echospline::ECHOSPLINE_CORE::force_entries, &echospline::ECHOSPLINE_CORE::space_entries,
-    &echospline::ECHOSPLINE_CORE::green_entries};
+    &echospline::ECHOSPLINE_CORE::green_entries, &echospline::ECHOSPLINE_CORE::spatial_entries};
 }

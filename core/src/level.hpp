@@ -20,6 +20,7 @@ struct PictureEntries;  // pictures: picture_entries.hpp
 struct ForceEntries;    // tissue under a needle's forces: force_entries.hpp
 struct GreenEntries;    // Green's function of tissue: green_entries.hpp
 struct SpaceEntries;    // volumes and fields of forces: space_entries.hpp
+struct SpatialEntries;  // tissue in space under a needle's forces: spatial_entries.hpp
 
 /// One level of the processor.
 struct Level {
@@ -29,6 +30,7 @@ struct Level {
   const ForceEntries* force;
   const SpaceEntries* space;
   const GreenEntries* green;
+  const SpatialEntries* spatial;
 };
 
 /// Table of a level, or nullptr where the library does not hold it or the processor cannot run it. `ECHOSPLINE_LEVEL_BEST` is the best one.

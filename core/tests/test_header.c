@@ -1,5 +1,6 @@
 /* The C interface is pinned: the header compiles as C17 and as C++20, and sizes, offsets and enum values never change unnoticed. */
 #include "echospline/echospline.h"
+#include "echospline/green.h"
 
 #include <assert.h>
 #include <stddef.h>
@@ -60,6 +61,13 @@ VALUE(SHAFT, 1);
 VALUE(BEVEL, 2);
 VALUE(TAIL, 4);
 VALUE(SHADOW, 8);
+VALUE(GREEN_BOUNDARY, 0);
+VALUE(GREEN_SOLVE, 1);
+VALUE(CONDITION_CLAMPED, 0);
+VALUE(CONDITION_SLIDING_X, 1);
+VALUE(CONDITION_SLIDING_Y, 2);
+VALUE(CONDITION_FREE, 3);
+VALUE(CONDITION_INTERFACE, 4);
 
 #if UINTPTR_MAX == UINT64_MAX
 #define SIZE(type, size) static_assert(sizeof(type) == size, #type)
@@ -231,6 +239,47 @@ OFFSET(echospline_needle_load, friction, 8);
 OFFSET(echospline_needle_load, side, 16);
 OFFSET(echospline_needle_load, torque, 24);
 OFFSET(echospline_needle_load, cut, 32);
+
+SIZE(echospline_green_options, 304);
+OFFSET(echospline_green_options, struct_size, 0);
+OFFSET(echospline_green_options, level, 4);
+OFFSET(echospline_green_options, method, 8);
+OFFSET(echospline_green_options, clamped, 12);
+OFFSET(echospline_green_options, sliding, 16);
+OFFSET(echospline_green_options, shape, 20);
+OFFSET(echospline_green_options, reserved, 28);
+OFFSET(echospline_green_options, spacing, 32);
+OFFSET(echospline_green_options, origin, 48);
+OFFSET(echospline_green_options, radius, 64);
+OFFSET(echospline_green_options, weight, 72);
+OFFSET(echospline_green_options, pin_weight, 80);
+OFFSET(echospline_green_options, pin_radius, 88);
+OFFSET(echospline_green_options, lattice, 96);
+OFFSET(echospline_green_options, bodies, 104);
+OFFSET(echospline_green_options, depths, 112);
+OFFSET(echospline_green_options, circles, 120);
+OFFSET(echospline_green_options, sources, 128);
+OFFSET(echospline_green_options, source_counts, 136);
+OFFSET(echospline_green_options, conditions, 144);
+OFFSET(echospline_green_options, sides, 152);
+OFFSET(echospline_green_options, pins, 160);
+OFFSET(echospline_green_options, order, 168);
+OFFSET(echospline_green_options, right, 176);
+OFFSET(echospline_green_options, left, 184);
+OFFSET(echospline_green_options, body_count, 192);
+OFFSET(echospline_green_options, band_count, 200);
+OFFSET(echospline_green_options, source_count, 208);
+OFFSET(echospline_green_options, condition_count, 216);
+OFFSET(echospline_green_options, pin_count, 224);
+OFFSET(echospline_green_options, rank, 232);
+OFFSET(echospline_green_options, lines_x, 240);
+OFFSET(echospline_green_options, lines_y, 248);
+OFFSET(echospline_green_options, moduli, 256);
+OFFSET(echospline_green_options, held, 264);
+OFFSET(echospline_green_options, line_x_count, 272);
+OFFSET(echospline_green_options, line_y_count, 280);
+OFFSET(echospline_green_options, triangle_count, 288);
+OFFSET(echospline_green_options, held_count, 296);
 #endif
 
 int main(void) {

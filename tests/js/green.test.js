@@ -67,7 +67,14 @@ test("tables that do not fit are refused", { skip }, () => {
   refused({ sources: tables.sources.slice(2) }, /source_counts must add up/);
   refused({ wonder: 3 }, /wonder/);
   refused({ method: 5 }, /method must be/);
-  refused({ left: [1] }, /no left/);
+  refused({ left: [1] }, /got left/);
+  refused({ source_count: 7 }, /got source_count/);
+  refused({ shape: undefined }, /2 whole numbers of shape/);
+  refused({ shape: [1.5, 30] }, /2 whole numbers of shape/);
+  refused({ band_count: 0.5 }, /1 whole number of band_count/);
+  refused({ radius: NaN }, /1 finite number of radius/);
+  refused({ bodies: 4096 }, /2 numbers per entry of bodies/);
+  refused({ depths: tables.depths.slice(1) }, /numbers of depths/);
   const green = core.green({ tip: 0.3 }, tables);
   assert.throws(() => green.displacementAt([100, 3]), (error) => error.status === Status.WRONG_VALUE);
   green.destroy();

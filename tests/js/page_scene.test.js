@@ -3,7 +3,8 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { PackError, readPack } from "../../src/echospline/page/static/scene.js";
+import { PackError } from "../../src/echospline/page/static/checked.js";
+import { readPack } from "../../src/echospline/page/static/scene.js";
 import { Attempt, fileOf, posesOf, readSessions } from "../../src/echospline/page/static/training.js";
 import { LANGUAGES, WORD_KEYS, printed, wordsOf } from "../../src/echospline/page/static/words.js";
 import { EXERCISE, manifest, packed, speckle } from "../node/made_pack.mjs";

@@ -51,6 +51,7 @@ public static class Driver
                 Require(error.Status == Status.WrongSize && error.Message.Length > 0, "a wrong size is refused");
             }
             DrawPicture(tissue, field, pose);
+            PushForced(pose);
             tissue.Reset();
             tissue.Displacement(field);
             foreach (var u in field) Require(u == 0, "rest is rest");
@@ -90,6 +91,59 @@ public static class Driver
             var followed = new byte[picture.Size];
             picture.Draw(ref needle, followed);
             for (int i = 0; i < drawn.Length; ++i) Require(Math.Abs(drawn[i] - followed[i]) <= 1, "a picture follows its tissue");
+        }
+    }
+
+    private static void PushForced(Pose pose)
+    {
+        var options = GreenOptions.Defaults();
+        options.Method = GreenMethod.GreenSolve;
+        options.Sliding = Edge.Top;
+        options.Clamped = Edge.Left | Edge.Right | Edge.Bottom;
+        options.Shape = new Shape2(41, 31);
+        options.Spacing = new Point2(1, 1);
+        options.Radius = 0.4;
+        const int Across = 8, Down = 6;
+        var tables = new GreenTables
+        {
+            LinesX = new double[Across + 1], LinesY = new double[Down + 1], Moduli = new double[4 * Across * Down],
+            Held = new byte[2 * (2 * Across + 1) * (2 * Down + 1)]
+        };
+        for (int i = 0; i <= Across; ++i) tables.LinesX[i] = 40.0 * i / Across;
+        for (int i = 0; i <= Down; ++i) tables.LinesY[i] = 30.0 * i / Down;
+        for (int i = 0; i < tables.Moduli.Length; ++i) tables.Moduli[i] = 0.03;  // N/mm: both of Lame's moduli
+        for (int j = 0; j <= 2 * Down; ++j)
+            for (int i = 0; i <= 2 * Across; ++i)
+            {
+                bool clamped = i == 0 || i == 2 * Across || j == 2 * Down;
+                tables.Held[2 * (j * (2 * Across + 1) + i)] = (byte)(clamped ? 1 : 0);
+                tables.Held[2 * (j * (2 * Across + 1) + i) + 1] = (byte)(clamped || j == 0 ? 1 : 0);
+            }
+        var law = ForcedOptions.Defaults();
+        law.NodeCount = 41 * 31;
+        law.High = new Point2(40, 30);
+        using (var green = new Green(options, tables))
+        using (var tissue = new Forced(law, green))
+        using (var other = new Forced(law, green))
+        {
+            pose = new Pose { Entry = new Point(20, 0), Tip = new Point(20, 0), Dt = 0.02 };
+            for (int step = 0; step < 60; ++step)
+            {
+                pose.Tip = new Point(20, 0.25 * step);
+                tissue.Advance(ref pose);
+            }
+            Require(tissue.Load().Tip > 0 && tissue.Stations().Length > 5, "the green answers every station");
+            var field = new double[2 * 41 * 31];
+            var at = new double[2];
+            tissue.Displacement(field);
+            tissue.DisplacementAt(new double[] { 20, 12 }, at);
+            Require(Math.Abs(field[2 * (12 * 41 + 20) + 1] - at[1]) < 1e-5 && at[1] > 0.05, "a node moves as its place does");
+            other.Restore(tissue.Save());
+            var again = new double[field.Length];
+            other.Displacement(again);
+            for (int i = 0; i < field.Length; ++i) Require(field[i] == again[i], "a saved state comes back");
+            green.Answer(new double[] { 20, 12 }, new double[] { 0, 0.1 }, 1, null, field, null);
+            Require(field[2 * (12 * 41 + 20) + 1] > 0, "tissue moves with a force");
         }
     }
 

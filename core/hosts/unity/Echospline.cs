@@ -39,6 +39,13 @@ namespace Echospline
 
     public enum Method { MethodAuto = 0, MethodExact = 1, MethodPull = 2 }
 
+    public enum GreenMethod { GreenBoundary = 0, GreenSolve = 1 }
+
+    public enum GreenCondition
+    {
+        ConditionClamped = 0, ConditionSlidingX = 1, ConditionSlidingY = 2, ConditionFree = 3, ConditionInterface = 4
+    }
+
     [Flags]
     public enum NeedlePart : uint { Shaft = 1, Bevel = 2, Tail = 4, Shadow = 8 }
 
@@ -482,6 +489,7 @@ namespace Echospline
 
         private readonly Answer answer;
         private IntPtr handle;
+        private Green green;  // kept from the collector
 
         public Forced(ForcedOptions options, Answer answer)
         {
@@ -492,6 +500,25 @@ namespace Echospline
             var message = Native.Text(Native.echospline_forced_message(handle));
             Dispose();
             throw new EchosplineException(status, message);
+        }
+
+        /// <summary>Tissue that a green of its mesh and level answers, in the core; the green has to live as long.</summary>
+        public Forced(ForcedOptions options, Green green) : this(options, (Answer)null)
+        {
+            var status = Native.echospline_forced_attach(handle, green.Handle);
+            this.green = green;
+            if (status == Status.Ok) return;
+            var message = Native.Text(Native.echospline_forced_message(handle));
+            Dispose();
+            throw new EchosplineException(status, message);
+        }
+
+        /// <summary>Displacement of reference points in the tissue, two numbers each, mm; needs a green.</summary>
+        public void DisplacementAt(double[] points, double[] displacement)
+        {
+            if (displacement.Length < points.Length)
+                throw new ArgumentException("expected room for " + points.Length + " numbers; got " + displacement.Length);
+            Check(Native.echospline_forced_displacement_at(handle, points, points.LongLength / 2, displacement));
         }
 
         /// <summary>Back to rest.</summary>
@@ -581,6 +608,132 @@ namespace Echospline
         private void Check(Status status)
         {
             if (status != Status.Ok) throw new EchosplineException(status, Native.Text(Native.echospline_forced_message(handle)));
+        }
+    }
+
+    /// <summary>echospline_green_options; begin with GreenOptions.Defaults(). Arrays are those of GreenTables.</summary>
+    [StructLayout(LayoutKind.Sequential)]
+    public struct GreenOptions
+    {
+        public uint StructSize;
+        public Level Level;
+        public GreenMethod Method;
+        public Edge Clamped, Sliding;
+        public Shape2 Shape;
+        public int Reserved;
+        public Point2 Spacing, Origin;
+        public double Radius;
+        public double Weight;
+        public double PinWeight;
+        public double PinRadius;
+        public double Lattice;
+        public IntPtr Bodies, Depths, Circles, Sources, SourceCounts, Conditions, Sides, Pins, Order, Right, Left;
+        public long BodyCount, BandCount, SourceCount, ConditionCount, PinCount, Rank;
+        public IntPtr LinesX, LinesY, Moduli, Held;
+        public long LineXCount, LineYCount, TriangleCount, HeldCount;
+
+        /// <summary>The core's own defaults; mesh, radius and what the method needs have to be set.</summary>
+        public static GreenOptions Defaults()
+        {
+            var options = new GreenOptions { StructSize = (uint)Marshal.SizeOf(typeof(GreenOptions)) };
+            Native.echospline_green_defaults(ref options);
+            return options;
+        }
+    }
+
+    /// <summary>Tables of echospline_green_options, flat, named as there; those of the other method stay null.</summary>
+    public sealed class GreenTables
+    {
+        public double[] Bodies, Depths, Circles, Sources, Conditions, Pins, LinesX, LinesY, Moduli;
+        public int[] SourceCounts, Sides, Order;
+        public byte[] Held;
+    }
+
+    /// <summary>How tissue in the plane answers forces, by Green's function. Threads may share it if no call of theirs fails.</summary>
+    public sealed class Green : IDisposable
+    {
+        private IntPtr handle;
+
+        /// <summary>Counts of the options but BandCount follow from the tables.</summary>
+        public Green(GreenOptions options, GreenTables tables)
+        {
+            Core.RequireVersion();
+            options.BodyCount = Entries(tables.Bodies, 2, "Bodies");
+            options.SourceCount = Entries(tables.Sources, 2, "Sources");
+            options.ConditionCount = Entries(tables.Conditions, 4, "Conditions");
+            options.PinCount = Entries(tables.Pins, 2, "Pins");
+            options.Rank = Entries(tables.Order, 1, "Order");
+            options.LineXCount = Entries(tables.LinesX, 1, "LinesX");
+            options.LineYCount = Entries(tables.LinesY, 1, "LinesY");
+            options.TriangleCount = Entries(tables.Moduli, 2, "Moduli");
+            options.HeldCount = Entries(tables.Held, 1, "Held");
+            if (options.Method == GreenMethod.GreenBoundary)
+            {
+                Require(tables.Depths, options.BandCount + 1, "Depths");
+                Require(tables.Circles, 3 * (options.BodyCount - options.BandCount), "Circles");
+                Require(tables.SourceCounts, options.BodyCount, "SourceCounts");
+                Require(tables.Sides, 3 * options.ConditionCount, "Sides");
+            }
+            options.Right = options.Left = IntPtr.Zero;
+            var arrays = new Array[]
+            {
+                tables.Bodies, tables.Depths, tables.Circles, tables.Sources, tables.SourceCounts, tables.Conditions, tables.Sides,
+                tables.Pins, tables.Order, tables.LinesX, tables.LinesY, tables.Moduli, tables.Held
+            };
+            var pinned = new GCHandle[arrays.Length];
+            var at = new IntPtr[arrays.Length];
+            try
+            {
+                for (int i = 0; i < arrays.Length; ++i)
+                {
+                    if (arrays[i] == null) continue;
+                    pinned[i] = GCHandle.Alloc(arrays[i], GCHandleType.Pinned);
+                    at[i] = pinned[i].AddrOfPinnedObject();
+                }
+                options.Bodies = at[0]; options.Depths = at[1]; options.Circles = at[2]; options.Sources = at[3];
+                options.SourceCounts = at[4]; options.Conditions = at[5]; options.Sides = at[6]; options.Pins = at[7];
+                options.Order = at[8]; options.LinesX = at[9]; options.LinesY = at[10]; options.Moduli = at[11]; options.Held = at[12];
+                var status = Native.echospline_green_create(ref options, out handle);
+                if (status == Status.Ok) return;
+                var message = Native.Text(Native.echospline_green_message(handle));
+                Dispose();
+                throw new EchosplineException(status, message);
+            }
+            finally
+            {
+                foreach (var pin in pinned) if (pin.IsAllocated) pin.Free();
+            }
+        }
+
+        internal IntPtr Handle { get { return handle; } }
+
+        /// <summary>Displacement (count, 2, cases) mm of nodes and of points under forces (places, 2, cases) N; mesh or at may be null.</summary>
+        public void Answer(double[] places, double[] forces, int cases, double[] points, double[] mesh, double[] at)
+        {
+            if (forces.LongLength != places.LongLength * cases)
+                throw new ArgumentException("expected " + places.LongLength * cases + " numbers of forces; got " + forces.LongLength);
+            var status = Native.echospline_green_answer(handle, places, places.LongLength / 2, forces, cases, points,
+                points == null ? 0 : points.LongLength / 2, mesh, mesh == null ? 0 : mesh.LongLength, at, at == null ? 0 : at.LongLength);
+            if (status != Status.Ok) throw new EchosplineException(status, Native.Text(Native.echospline_green_message(handle)));
+        }
+
+        public void Dispose()
+        {
+            Native.echospline_green_destroy(handle);
+            handle = IntPtr.Zero;
+        }
+
+        private static long Entries(Array table, int width, string name)
+        {
+            long numbers = table == null ? 0 : table.LongLength;
+            if (numbers % width != 0) throw new ArgumentException("expected " + width + " numbers per entry of " + name + "; got " + numbers);
+            return numbers / width;
+        }
+
+        private static void Require(Array table, long count, string name)
+        {
+            long numbers = table == null ? 0 : table.LongLength;
+            if (numbers != count) throw new ArgumentException("expected " + count + " numbers of " + name + "; got " + numbers);
         }
     }
 
@@ -767,5 +920,12 @@ namespace Echospline
         [DllImport(Library)] internal static extern long echospline_forced_state_size(IntPtr forced);
         [DllImport(Library)] internal static extern Status echospline_forced_state_save(IntPtr forced, [Out] byte[] bytes, long size);
         [DllImport(Library)] internal static extern Status echospline_forced_state_load(IntPtr forced, byte[] bytes, long size);
+        [DllImport(Library)] internal static extern void echospline_green_defaults(ref GreenOptions options);
+        [DllImport(Library)] internal static extern Status echospline_green_create(ref GreenOptions options, out IntPtr green);
+        [DllImport(Library)] internal static extern void echospline_green_destroy(IntPtr green);
+        [DllImport(Library)] internal static extern IntPtr echospline_green_message(IntPtr green);
+        [DllImport(Library)] internal static extern Status echospline_green_answer(IntPtr green, double[] places, long place_count, double[] forces, long case_count, double[] points, long point_count, [Out] double[] mesh, long mesh_count, [Out] double[] at, long at_count);
+        [DllImport(Library)] internal static extern Status echospline_forced_attach(IntPtr forced, IntPtr green);
+        [DllImport(Library)] internal static extern Status echospline_forced_displacement_at(IntPtr forced, double[] points, long point_count, [Out] double[] displacement);
     }
 }

@@ -53,10 +53,23 @@ struct GreenMesh {
   }
 };
 
-/// A force of a load case.
+/// A place and its forces in two load cases, which are answered together.
 struct GreenForce {
-  Vec<2> place, force;
+  Vec<2> place, force[2];
 };
+
+/// Products of a row of n doubles with two others.
+ECHOSPLINE_INLINE void two_products(const double* row, const double* a, const double* b, int64_t n, double& s,
+                                    double& t) {
+  Doubles S = {}, T = {};
+  int64_t i = 0;
+  for (; i + DOUBLE_LANES <= n; i += DOUBLE_LANES) {
+    const Doubles c = load(row + i);
+    S += c * load(a + i), T += c * load(b + i);
+  }
+  s = total(S), t = total(T);
+  for (; i < n; ++i) s += row[i] * a[i], t += row[i] * b[i];
+}
 
 class BoundaryGreen {
  public:
@@ -65,7 +78,8 @@ class BoundaryGreen {
     mesh_ = &mesh, radius_ = o.radius, weight_ = o.weight, pin_weight_ = o.pin_weight, pin_radius_ = o.pin_radius;
     bodies_ = o.body_count, bands_ = o.band_count, conditions_ = o.condition_count, pins_ = o.pin_count, rank_ = o.rank;
     if (!body_.reserve(bodies_) || !depth_.reserve(bands_ + 1) || !circle_.reserve(3 * (bodies_ - bands_)) ||
-        !source_.reserve(o.source_count) || !condition_.reserve(conditions_) || !pin_.reserve(pins_))
+        !source_.reserve(o.source_count) || !condition_.reserve(conditions_) || !pin_.reserve(pins_) ||
+        !body_at_.reserve(mesh.nodes()))
       return false;
     const Surface top = mesh.clamped & ECHOSPLINE_TOP   ? Surface::clamped
                         : mesh.sliding & ECHOSPLINE_TOP ? Surface::sliding
@@ -82,6 +96,7 @@ class BoundaryGreen {
     own_ = unknowns_, unknowns_ += 2 * pins_;
     for (int64_t i = 0; i <= bands_; ++i) depth_[i] = o.depths[i];
     for (int64_t i = 0; i < circle_.size(); ++i) circle_[i] = o.circles[i];
+    for (int64_t i = 0; i < mesh.nodes(); ++i) body_at_[i] = static_cast<int32_t>(locate(mesh.node(i)));
     for (int64_t i = 0; i < o.source_count; ++i) source_[i] = point_of<2>(o.sources + 2 * i);
     for (int64_t i = 0; i < pins_; ++i) pin_[i] = point_of<2>(o.pins + 2 * i);
     for (int64_t i = 0; i < conditions_; ++i) {
@@ -96,54 +111,56 @@ class BoundaryGreen {
 
   int64_t unknowns() const { return unknowns_; }
 
-  /// Strengths of the unknowns under forces; room for rows and rank numbers is the caller's.
-  void strengths(const GreenForce* forces, int64_t count, double* load, double* kept, double* c) const {
-    for (int64_t i = 0; i < padded(rows_); ++i) load[i] = 0;
-    for (int64_t i = 0; i < count; ++i) add_load(forces[i].place, forces[i].force, radius_, load);
+  /// Strengths of the unknowns in two load cases, one after the other; so is the room for conditions and kept unknowns.
+  void strengths(const GreenForce* forces, int64_t count, double* load, double* kept, double* a, double* b) const {
     const int64_t ld = padded(rows_), lk = padded(rank_);
-    for (int64_t r = 0; r < lk; ++r) kept[r] = r < rank_ ? dot(left_.data() + r * ld, load, ld) : 0;
-    for (int64_t j = 0; j < unknowns_; ++j) c[j] = -dot(right_.data() + j * lk, kept, lk);
-    for (int64_t j = unknowns_; j < padded(unknowns_); ++j) c[j] = 0;
+    for (int64_t i = 0; i < 2 * ld; ++i) load[i] = 0;
+    for (int64_t i = 0; i < count; ++i) add_load(forces[i], 2, radius_, load);
+    for (int64_t r = 0; r < rank_; ++r)
+      two_products(left_.data() + r * ld, load, load + ld, rows_, kept[r], kept[lk + r]);
+    for (int64_t j = 0; j < unknowns_; ++j) {
+      two_products(right_.data() + j * lk, kept, kept + lk, rank_, a[j], b[j]);
+      a[j] = -a[j], b[j] = -b[j];
+    }
+    for (int64_t j = unknowns_; j < padded(unknowns_); ++j) a[j] = b[j] = 0;
   }
-  int64_t load_room() const { return padded(rows_); }
-  int64_t kept_room() const { return padded(rank_); }
+  int64_t load_room() const { return 2 * padded(rows_); }
+  int64_t kept_room() const { return 2 * padded(rank_); }
   int64_t strengths_room() const { return padded(unknowns_); }
   /// Numbers that `field` works in.
-  int64_t field_room() const { return 2 * lattice_x_ * lattice_y_ + 2 * mesh_->down * lattice_x_; }
+  int64_t field_room() const { return 4 * lattice_x_ * (lattice_y_ + 1); }
 
-  /// Displacement of the mesh nodes, (nodes, 2), by strengths and forces.
-  void field(const double* c, const GreenForce* forces, int64_t count, double* room, double* u) const {
+  /// Displacement of the mesh nodes, (nodes, 2), in two load cases by strengths and forces.
+  void field(const double* a, const double* b, const GreenForce* forces, int64_t count, double* room, double* u,
+             double* v) const {
     const int64_t n = mesh_->nodes(), ld = padded(own_);
     if (lattice_x_ == 0) {
-      for (int64_t i = 0; i < 2 * n; ++i) u[i] = dot(columns_.data() + i * ld, c, own_ / ROW * ROW) + rest(i * ld, c);
+      for (int64_t i = 0; i < 2 * n; ++i) two_products(columns_.data() + i * ld, a, b, own_, u[i], v[i]);
     } else {
-      double* coarse = room;
-      double* along = room + 2 * lattice_x_ * lattice_y_;  // mesh rows, lattice columns
-      for (int64_t i = 0; i < 2 * lattice_x_ * lattice_y_; ++i)
-        coarse[i] = dot(columns_.data() + i * ld, c, own_ / ROW * ROW) + rest(i * ld, c);
-      const int64_t row = 2 * lattice_x_;
+      const int64_t row = 4 * lattice_x_;
+      double* along = room + row * lattice_y_;  // one mesh row, lattice columns
+      for (int64_t i = 0; i < lattice_x_ * lattice_y_; ++i)
+        for (int d = 0; d < 2; ++d)
+          two_products(columns_.data() + (2 * i + d) * ld, a, b, own_, room[4 * i + d], room[4 * i + 2 + d]);
       for (int64_t y = 0; y < mesh_->down; ++y) {
-        double* to = along + y * row;
-        for (int64_t i = 0; i < row; ++i) to[i] = 0;
+        for (int64_t i = 0; i < row; ++i) along[i] = 0;
         for (int64_t l = 0; l < lattice_y_; ++l) {
           const double f = along_y_[y * lattice_y_ + l];
-          for (int64_t i = 0; i < row; ++i) to[i] += f * coarse[l * row + i];
+          for (int64_t i = 0; i < row; ++i) along[i] += f * room[l * row + i];
         }
         for (int64_t x = 0; x < mesh_->across; ++x) {
-          double a = 0, b = 0;
-          for (int64_t l = 0; l < lattice_x_; ++l) {
-            const double f = along_x_[x * lattice_x_ + l];
-            a += f * to[2 * l], b += f * to[2 * l + 1];
-          }
-          u[2 * (y * mesh_->across + x)] = a, u[2 * (y * mesh_->across + x) + 1] = b;
+          double sum[4] = {};
+          for (int64_t l = 0; l < lattice_x_; ++l)
+            for (int k = 0; k < 4; ++k) sum[k] += along_x_[x * lattice_x_ + l] * along[4 * l + k];
+          const int64_t i = 2 * (y * mesh_->across + x);
+          u[i] = sum[0], u[i + 1] = sum[1], v[i] = sum[2], v[i + 1] = sum[3];
         }
       }
     }
-    for (int64_t i = 0; i < n; ++i) {
-      const Vec<2> p = mesh_->node(i);
-      add_closed(p, body_[locate(p)].base, forces, count, c, u + 2 * i);
-      mesh_->hold(p, u + 2 * i);
-    }
+    for (int64_t y = 0; y < mesh_->down; ++y)
+      for (int64_t x = 0; x < mesh_->across; x += DOUBLE_LANES)
+        add_closed(x, y, forces, count, a, b, u + 2 * y * mesh_->across, v + 2 * y * mesh_->across);
+    for (int64_t i = 0; i < n; ++i) mesh_->hold(mesh_->node(i), u + 2 * i), mesh_->hold(mesh_->node(i), v + 2 * i);
   }
 
   /// Add to two rows of columns, which take the strengths of all but clamped points to the displacement of a point, times a weight;
@@ -162,16 +179,16 @@ class BoundaryGreen {
       x[2 * b.sources + m] += moves[0] * v[0], y[2 * b.sources + m] += moves[1] * v[1];
     }
   }
-  /// Displacement of a point by the closed form of forces, those at clamped points among them.
-  Vec<2> closed_at(const Vec<2>& p, const double* c, const GreenForce* forces, int64_t count) const {
+  /// Displacement of a point by the closed form of forces of a load case, those at clamped points among them.
+  Vec<2> closed_at(const Vec<2>& p, const double* c, const GreenForce* forces, int64_t count, int w) const {
     Vec<2> u = {};
-    add_closed(p, body_[locate(p)].base, forces, count, c, u.v);
+    add_closed(p, body_[locate(p)].base, forces, count, w, c, u.v);
     mesh_->hold(p, u.v);
     return u;
   }
 
-  /// Displacement of a point, mm.
-  Vec<2> at(const Vec<2>& p, const double* c, const GreenForce* forces, int64_t count) const {
+  /// Displacement of a point in a load case, mm.
+  Vec<2> at(const Vec<2>& p, const double* c, const GreenForce* forces, int64_t count, int w) const {
     Vec<2> u = {};
     const Body& b = body_[locate(p)];
     for (int64_t j = 0; j < b.sources; ++j) {
@@ -183,7 +200,7 @@ class BoundaryGreen {
       const Vec<2> v = motion(b, p, m);
       u = u + c[b.first + 2 * b.sources + m] * v;
     }
-    add_closed(p, b.base, forces, count, c, u.v);
+    add_closed(p, b.base, forces, count, w, c, u.v);
     mesh_->hold(p, u.v);
     return u;
   }
@@ -204,6 +221,7 @@ class BoundaryGreen {
   int64_t lattice_x_ = 0, lattice_y_ = 0;  // points of the Chebyshev lattice; 0: strengths go to the mesh nodes at once
   Array<Body> body_;
   Array<double> depth_, circle_, right_, left_, columns_, along_x_, along_y_;
+  Array<int32_t> body_at_;  // part of the tissue at each node
   Array<Vec<2>> source_, pin_;
   Array<Condition> condition_;
 
@@ -217,13 +235,6 @@ class BoundaryGreen {
     return body;
   }
 
-  /// What is left of a product of a row of the columns with strengths, for their number is no multiple of ROW and pins follow.
-  double rest(int64_t row, const double* c) const {
-    double sum = 0;
-    for (int64_t j = own_ / ROW * ROW; j < own_; ++j) sum += columns_[row + j] * c[j];
-    return sum;
-  }
-
   /// A motion as a whole, as large as the field of 1 N.
   Vec<2> motion(const Body& b, const Vec<2>& p, int m) const {
     const double k = b.outside.scale(), size = mesh_->size();
@@ -232,59 +243,93 @@ class BoundaryGreen {
     return {{-k * (p[1] - centre[1]) / size, k * (p[0] - centre[0]) / size}};
   }
 
-  /// Add the closed form of forces, and of those at clamped points.
-  void add_closed(const Vec<2>& p, const HalfPlane& base, const GreenForce* forces, int64_t count, const double* c,
-                  double* u) const {
-    for (int64_t i = 0; i < count; ++i) {
-      const Block K = base.displacement(p, forces[i].place, radius_);
-      for (int d = 0; d < 2; ++d) u[d] += K.v[d][0] * forces[i].force[0] + K.v[d][1] * forces[i].force[1];
+  /// Add the closed form of forces of a load case, and of those at clamped points.
+  void add_closed(const Vec<2>& p, const HalfPlane& base, const GreenForce* forces, int64_t count, int w,
+                  const double* c, double* u) const {
+    for (int64_t i = 0; i < count; ++i) apply(base.displacement(p, forces[i].place, radius_), forces[i].force[w], 1, u);
+    for (int64_t i = 0; i < pins_; ++i)
+      apply(base.displacement(p, pin_[i], pin_radius_), point_of<2>(c + own_ + 2 * i), 1, u);
+  }
+  /// The same for nodes x, x + 1, ... of a mesh row, as many as a register holds, in both load cases; u and v are the row's.
+  void add_closed(int64_t x, int64_t y, const GreenForce* forces, int64_t count, const double* a, const double* b,
+                  double* u, double* v) const {
+    const int64_t left = mesh_->across - x, nodes = left < DOUBLE_LANES ? left : DOUBLE_LANES;
+    const int64_t first = y * mesh_->across + x;
+    const int32_t body = body_at_[first];
+    bool same = true;
+    for (int64_t i = 1; i < nodes; ++i) same = same && body_at_[first + i] == body;
+    if (!same) {
+      for (int64_t i = 0; i < nodes; ++i) {
+        const HalfPlane& base = body_[body_at_[first + i]].base;
+        add_closed(mesh_->node(first + i), base, forces, count, 0, a, u + 2 * (x + i));
+        add_closed(mesh_->node(first + i), base, forces, count, 1, b, v + 2 * (x + i));
+      }
+      return;
     }
-    for (int64_t i = 0; i < pins_; ++i) {
-      const Block K = base.displacement(p, pin_[i], pin_radius_);
-      const double* f = c + own_ + 2 * i;
-      for (int d = 0; d < 2; ++d) u[d] += K.v[d][0] * f[0] + K.v[d][1] * f[1];
-    }
+    const HalfPlane& base = body_[body].base;
+    const double depth = mesh_->node(first)[1] - base.surface;
+    Doubles across, moved[2][2] = {};
+    for (int i = 0; i < DOUBLE_LANES; ++i)
+      across[i] = mesh_->origin[0] + mesh_->spacing[0] * static_cast<double>(x + i);
+    const auto add = [&](const Vec<2>& place, const Vec<2>& f, const Vec<2>& g, double radius) {
+      Doubles K[2][2];
+      base.displacement(across - place[0], depth, base.depth(place, radius), radius, K);
+      for (int d = 0; d < 2; ++d)
+        moved[0][d] += K[d][0] * f[0] + K[d][1] * f[1], moved[1][d] += K[d][0] * g[0] + K[d][1] * g[1];
+    };
+    for (int64_t i = 0; i < count; ++i) add(forces[i].place, forces[i].force[0], forces[i].force[1], radius_);
+    for (int64_t i = 0; i < pins_; ++i)
+      add(pin_[i], point_of<2>(a + own_ + 2 * i), point_of<2>(b + own_ + 2 * i), pin_radius_);
+    for (int64_t i = 0; i < nodes; ++i)
+      for (int d = 0; d < 2; ++d) u[2 * (x + i) + d] += moved[0][d][i], v[2 * (x + i) + d] += moved[1][d][i];
   }
 
   static bool moves(const Condition& c) { return c.kind != ECHOSPLINE_CONDITION_FREE; }
   static bool pulls(const Condition& c) { return c.kind != ECHOSPLINE_CONDITION_CLAMPED; }
 
-  /// Put displacement u and weighted traction t at a condition into its rows, `step` numbers apart; returns how many there are.
-  static int rows_of(const Condition& c, const double* u, const double* t, double sign, double* row, int64_t step) {
+  /// Add displacement u and weighted traction t at a condition to its rows; returns how many there are.
+  static int rows_of(const Condition& c, const double* u, const double* t, double sign, double* row) {
     switch (c.kind) {
-      case ECHOSPLINE_CONDITION_CLAMPED: row[0] += sign * u[0], row[step] += sign * u[1]; return 2;
-      case ECHOSPLINE_CONDITION_SLIDING_X: row[0] += sign * u[0], row[step] += sign * t[1]; return 2;
-      case ECHOSPLINE_CONDITION_SLIDING_Y: row[0] += sign * t[0], row[step] += sign * u[1]; return 2;
-      case ECHOSPLINE_CONDITION_FREE: row[0] += sign * t[0], row[step] += sign * t[1]; return 2;
+      case ECHOSPLINE_CONDITION_CLAMPED: row[0] += sign * u[0], row[1] += sign * u[1]; return 2;
+      case ECHOSPLINE_CONDITION_SLIDING_X: row[0] += sign * u[0], row[1] += sign * t[1]; return 2;
+      case ECHOSPLINE_CONDITION_SLIDING_Y: row[0] += sign * t[0], row[1] += sign * u[1]; return 2;
+      case ECHOSPLINE_CONDITION_FREE: row[0] += sign * t[0], row[1] += sign * t[1]; return 2;
       default:
-        row[0] += sign * u[0], row[step] += sign * u[1];
-        row[2 * step] += sign * t[0], row[3 * step] += sign * t[1];
+        row[0] += sign * u[0], row[1] += sign * u[1];
+        row[2] += sign * t[0], row[3] += sign * t[1];
         return 4;
     }
   }
 
-  /// Add what a force at s does to a condition, on both sides of an interface, by the closed form below the top.
-  int add_force(const Condition& c, const Vec<2>& s, const Vec<2>& force, double radius, double* row,
-                int64_t step) const {
-    int count = 0;
-    for (int side = 0; side < (c.other < 0 ? 1 : 2); ++side) {
-      const HalfPlane& base = body_[side == 0 ? c.body : c.other].base;
-      double u[2] = {}, t[2] = {};
-      if (moves(c)) apply(base.displacement(c.place, s, radius), force, 1, u);
-      if (pulls(c)) apply(base.traction(c.place, c.normal, s, radius), force, weight_, t);
-      count = rows_of(c, u, t, side == 0 ? 1 : -1, row, step);
-    }
-    return count;
-  }
   static void apply(const Block& K, const Vec<2>& f, double factor, double* u) {
     for (int d = 0; d < 2; ++d) u[d] += factor * (K.v[d][0] * f[0] + K.v[d][1] * f[1]);
   }
 
-  void add_load(const Vec<2>& place, const Vec<2>& force, double radius, double* load) const {
+  /// Add what the forces at a place do to the conditions, on both sides of an interface, by the closed form below the top; conditions of
+  /// the second load case follow those of the first.
+  void add_load(const GreenForce& at, int cases, double radius, double* load) const {
     int64_t row = 0;
-    for (int64_t i = 0; i < conditions_; ++i) row += add_force(condition_[i], place, force, radius, load + row, 1);
-    for (int64_t i = 0; i < pins_; ++i, row += 2)
-      apply(body_[locate(pin_[i])].base.displacement(pin_[i], place, radius), force, pin_weight_, load + row);
+    const int64_t ld = padded(rows_);
+    for (int64_t i = 0; i < conditions_; ++i) {
+      const Condition& c = condition_[i];
+      int count = 0;
+      for (int side = 0; side < (c.other < 0 ? 1 : 2); ++side) {
+        const HalfPlane& base = body_[side == 0 ? c.body : c.other].base;
+        Block K = {}, T = {};
+        if (moves(c)) K = base.displacement(c.place, at.place, radius);
+        if (pulls(c)) T = base.traction(c.place, c.normal, at.place, radius);
+        for (int w = 0; w < cases; ++w) {
+          double u[2] = {}, t[2] = {};
+          apply(K, at.force[w], 1, u), apply(T, at.force[w], weight_, t);
+          count = rows_of(c, u, t, side == 0 ? 1 : -1, load + w * ld + row);
+        }
+      }
+      row += count;
+    }
+    for (int64_t i = 0; i < pins_; ++i, row += 2) {
+      const Block K = body_[locate(pin_[i])].base.displacement(pin_[i], at.place, radius);
+      for (int w = 0; w < cases; ++w) apply(K, at.force[w], pin_weight_, load + w * ld + row);
+    }
   }
 
   /// Column of the conditions under one unknown of unit strength, (rows) numbers.
@@ -292,7 +337,7 @@ class BoundaryGreen {
     if (unknown >= own_) {
       const int64_t k = (unknown - own_) / 2;
       const Vec<2> unit = {{(unknown - own_) % 2 == 0 ? 1.0 : 0.0, (unknown - own_) % 2 == 1 ? 1.0 : 0.0}};
-      add_load(pin_[k], unit, pin_radius_, column);
+      add_load({pin_[k], {unit, {}}}, 1, pin_radius_, column);
       return;
     }
     int64_t q = bodies_ - 1;
@@ -318,7 +363,7 @@ class BoundaryGreen {
         if (moves(c)) moved(c.place, 1, u);
         if (pulls(c) && !is_motion)
           apply(b.outside.traction(c.place, c.normal, source_[b.first_source + j / 2], 0), unit, weight_, t);
-        rows_of(c, u, t, c.body == q ? 1 : -1, column + row, 1);
+        rows_of(c, u, t, c.body == q ? 1 : -1, column + row);
       }
       row += count;
     }

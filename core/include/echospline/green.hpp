@@ -30,26 +30,23 @@ class Green {
   bool answer(const double* places, int64_t place_count, const double* forces, int64_t cases, const double* points,
               int64_t point_count, double* on_mesh, double* at) const {
     GreenWork work;
-    Array<GreenForce> load[2];
+    Array<GreenForce> load;
     Array<double> field;
-    if (!work.reserve(*this) || !load[0].reserve(place_count) || !load[1].reserve(place_count) ||
-        !field.reserve(2 * mesh.nodes()))
-      return false;
+    if (!work.reserve(*this) || !load.reserve(place_count) || !field.reserve(4 * mesh.nodes())) return false;
+    const int64_t n = 2 * mesh.nodes();
     for (int64_t k = 0; k < cases; k += 2) {
       const int width = k + 1 < cases ? 2 : 1;
-      for (int w = 0; w < 2; ++w)
-        for (int64_t i = 0; i < place_count; ++i) {
-          const double* f = forces + 2 * i * cases + k + w;
-          load[w][i] = {point_of<2>(places + 2 * i), w < width ? Vec<2>{{f[0], f[cases]}} : Vec<2>{}};
-        }
-      work.solve(*this, load[0].data(), load[1].data(), place_count);
+      for (int64_t i = 0; i < place_count; ++i) {
+        load[i] = {point_of<2>(places + 2 * i), {}};
+        const double* f = forces + 2 * i * cases + k;
+        for (int w = 0; w < width; ++w) load[i].force[w] = {{f[w], f[cases + w]}};
+      }
+      work.solve(*this, load.data(), place_count);
+      if (on_mesh) work.field(*this, load.data(), place_count, field.data(), field.data() + n);
       for (int w = 0; w < width; ++w) {
-        if (on_mesh) {
-          work.field(*this, w, load[w].data(), place_count, field.data());
-          for (int64_t i = 0; i < 2 * mesh.nodes(); ++i) on_mesh[i * cases + k + w] = field[i];
-        }
+        for (int64_t i = 0; on_mesh && i < n; ++i) on_mesh[i * cases + k + w] = field[w * n + i];
         for (int64_t i = 0; at && i < point_count; ++i) {
-          const Vec<2> u = work.at(*this, w, point_of<2>(points + 2 * i), load[w].data(), place_count);
+          const Vec<2> u = work.at(*this, w, point_of<2>(points + 2 * i), load.data(), place_count);
           for (int d = 0; d < 2; ++d) at[(2 * i + d) * cases + k + w] = u[d];
         }
       }
@@ -69,29 +66,26 @@ class Green {
                       : load.reserve(g.boundary.load_room()) && kept.reserve(g.boundary.kept_room()) &&
                             room.reserve(g.boundary.field_room());
     }
-    void solve(const Green& g, const GreenForce* a, const GreenForce* b, int64_t count) {
-      for (int w = 0; w < 2; ++w) {
-        const GreenForce* forces = w == 0 ? a : b;
-        double* s = solution[w].data();
-        if (!g.solves) {
-          g.boundary.strengths(forces, count, load.data(), kept.data(), s);
-          continue;
-        }
-        for (int64_t i = 0; i < solution[w].size(); ++i) s[i] = 0;
-        for (int64_t i = 0; i < count; ++i) g.quadratic.add_load(forces[i], s);
-      }
-      if (g.solves) g.quadratic.solve(solution[0].data(), solution[1].data(), room.data());
+    void solve(const Green& g, const GreenForce* forces, int64_t count) {
+      double *a = solution[0].data(), *b = solution[1].data();
+      if (!g.solves) return g.boundary.strengths(forces, count, load.data(), kept.data(), a, b);
+      for (int64_t i = 0; i < solution[0].size(); ++i) a[i] = b[i] = 0;
+      for (int64_t i = 0; i < count; ++i) g.quadratic.add_load(forces[i], a, b);
+      g.quadratic.solve(a, b, room.data());
     }
-    void field(const Green& g, int w, const GreenForce* forces, int64_t count, double* u) {
-      if (!g.solves) return g.boundary.field(solution[w].data(), forces, count, room.data(), u);
+    /// Displacement of the mesh nodes in both load cases.
+    void field(const Green& g, const GreenForce* forces, int64_t count, double* u, double* v) {
+      const double *a = solution[0].data(), *b = solution[1].data();
+      if (!g.solves) return g.boundary.field(a, b, forces, count, room.data(), u, v);
       for (int64_t i = 0; i < g.mesh.nodes(); ++i) {
-        const Vec<2> v = g.quadratic.at(g.quadratic.at_node(i), solution[w].data());
-        u[2 * i] = v[0], u[2 * i + 1] = v[1];
+        const SixNodes& six = g.quadratic.at_node(i);
+        const Vec<2> p = g.quadratic.at(six, a), q = g.quadratic.at(six, b);
+        for (int d = 0; d < 2; ++d) u[2 * i + d] = p[d], v[2 * i + d] = q[d];
       }
     }
     Vec<2> at(const Green& g, int w, const Vec<2>& p, const GreenForce* forces, int64_t count) const {
-      return g.solves ? g.quadratic.at(g.quadratic.locate(p), solution[w].data())
-                      : g.boundary.at(p, solution[w].data(), forces, count);
+      const double* c = solution[w].data();
+      return g.solves ? g.quadratic.at(g.quadratic.locate(p), c) : g.boundary.at(p, c, forces, count, w);
     }
   };
 };
@@ -102,7 +96,7 @@ class GreenStations {
   const Green* green = nullptr;
 
   bool attach(const Green* given) {
-    if (given && (!work_.reserve(*given) || !field_.reserve(2 * given->mesh.nodes()) ||
+    if (given && (!work_.reserve(*given) || !field_.reserve(4 * given->mesh.nodes()) ||
                   !columns_.reserve(4 * given->mesh.nodes()) || !rows_.reserve(4 * (MOST_STATIONS + 2))))
       return false;
     green = given;
@@ -115,13 +109,13 @@ class GreenStations {
     const SlipStation& s = tissue.wanted;
     for (int64_t i = 0; i < 4 * (j + 1); ++i) rows_[i] = 0;
     if (s.count == 0) return tissue.answer(nullptr, rows_.data());
-    GreenForce forces[2][4];
-    for (int d = 0; d < 2; ++d) spread(s, {{d == 0 ? 1.0 : 0.0, d == 1 ? 1.0 : 0.0}}, forces[d]);
+    GreenForce forces[4];  // along x in the first load case, along y in the second
+    spread(s, {{1, 0}}, {{0, 1}}, forces);
     if (!reserve(j)) return SlipTissue::no_memory;
-    work_.solve(*green, forces[0], forces[1], s.count);
+    work_.solve(*green, forces, s.count);
+    work_.field(*green, forces, s.count, field_.data(), field_.data() + 2 * n);
+    for (int64_t i = 0; i < 4 * n; ++i) columns_[i] = static_cast<float>(field_[i]);
     for (int d = 0; d < 2; ++d) {
-      work_.field(*green, d, forces[d], s.count, field_.data());
-      for (int64_t i = 0; i < 2 * n; ++i) columns_[d * 2 * n + i] = static_cast<float>(field_[i]);
       const double* solution = work_.solution[d].data();
       const int64_t numbers = work_.solution[d].size();
       if (green->solves)
@@ -137,7 +131,7 @@ class GreenStations {
     }
     for (int64_t i = 0; i <= j; ++i)
       for (int d = 0; d < 2; ++d) {
-        const Vec<2> u = mean_at(i, i == j ? s : tissue.station(i), d, forces[d], s.count);
+        const Vec<2> u = mean_at(i, i == j ? s : tissue.station(i), d, forces, s.count);
         for (int c = 0; c < 2; ++c) rows_[4 * i + 2 * c + d] = u[c];
       }
     return tissue.answer(columns_.data(), rows_.data());
@@ -160,7 +154,7 @@ class GreenStations {
         continue;
       }
       if (green->solves) continue;
-      spread(s, f, &forces[used]), used += s.count;
+      spread(s, f, {}, &forces[used]), used += s.count;
       const int64_t numbers = total.size();
       for (int64_t i = 0; i < numbers; ++i) total[i] += f[0] * strengths_[j][i] + f[1] * strengths_[j][numbers + i];
     }
@@ -174,7 +168,7 @@ class GreenStations {
             if (const double f = station_force[2 * j + d]; f != 0)
               v = v + f * green->quadratic.at(six, solved_[j].data() + d * green->quadratic.unknowns());
       } else if (used > 0) {
-        v = green->boundary.at(p, total.data(), forces.data(), used);
+        v = green->boundary.at(p, total.data(), forces.data(), used, 0);
       }
       u[2 * i] = v[0], u[2 * i + 1] = v[1];
     }
@@ -189,8 +183,8 @@ class GreenStations {
   Array<double> mean_[MOST_STATIONS + 2];  // boundary: rows that take strengths to the mean displacement over a station
   Array<float> solved_[MOST_STATIONS + 2];  // solve: displacement of the triangles' nodes
 
-  static void spread(const SlipStation& s, const Vec<2>& force, GreenForce* out) {
-    for (int i = 0; i < s.count; ++i) out[i] = {s.points[i], s.weights[i] * force};
+  static void spread(const SlipStation& s, const Vec<2>& first, const Vec<2>& second, GreenForce* out) {
+    for (int i = 0; i < s.count; ++i) out[i] = {s.points[i], {s.weights[i] * first, s.weights[i] * second}};
   }
 
   bool reserve(int64_t j) {
@@ -213,7 +207,7 @@ class GreenStations {
     }
     for (int k = 0; k < s.count; ++k)
       u = u + s.weights[k] * (green->solves ? green->quadratic.at(green->quadratic.locate(s.points[k]), c)
-                                            : green->boundary.closed_at(s.points[k], c, forces, count));
+                                            : green->boundary.closed_at(s.points[k], c, forces, count, d));
     return u;
   }
 };

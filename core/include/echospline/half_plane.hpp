@@ -5,6 +5,7 @@
 #include <cmath>
 #include <cstdint>
 
+#include "kernels.hpp"
 #include "level_begin.hpp"
 #include "vec.hpp"
 
@@ -12,6 +13,25 @@ namespace echospline::ECHOSPLINE_CORE {
 
 constexpr double CIRCLE = 6.283185307179586477;  // 2 pi
 constexpr double SHALLOWEST = 1.0;               // radii: least depth of a force below a free or clamped top
+
+/// Set-up runs once: these functions are compiled for size.
+#define SETUP_SIZE __attribute__((noinline))
+
+/// Angle in the right half plane to 3e-16: nearest of three known ones, and the series of what is left (below tan pi / 16).
+ECHOSPLINE_INLINE Doubles arctangent(Doubles t) {
+  const Doubles size = greatest(t, -t), one = all(1.0);
+  const Longs steep = size > one;
+  const Doubles a = pick(steep, one / size, size);
+  const Longs middle = a > all(0.19891236737965800691), upper = a > all(0.66817863791929891999);
+  const Doubles known = pick(upper, one, pick(middle, all(0.41421356237309504880), Doubles{}));
+  const Doubles angle = pick(upper, all(CIRCLE / 8), pick(middle, all(CIRCLE / 16), Doubles{}));
+  const Doubles s = (a - known) / (one + a * known), z = s * s;
+  Doubles p = z * (-1.0 / 23) + 1.0 / 21;
+  for (int n = 19; n >= 3; n -= 2) p = p * z + (n % 4 == 1 ? 1.0 : -1.0) / n;
+  const Doubles found = angle + (s + s * z * p), right = pick(steep, CIRCLE / 4 - found, found);
+  return pick(t < Doubles{}, -right, right);
+}
+inline double arctangent(double t) { return std::atan(t); }
 
 /// A complex number; std::complex would look for infinities in every product.
 struct Complex {
@@ -41,20 +61,30 @@ struct HalfPlane {
   double scale() const { return 1 / (4 * CIRCLE * stiffness * (1 - nu)); }
 
   /// Displacement of p by unit forces at s that are spread over a radius (0: points), mm/N.
-  Block displacement(const Vec<2>& p, const Vec<2>& s, double radius) const {
-    const double dx = p[0] - s[0], y = p[1] - surface, c = depth(s, radius);
-    double xx, yy, xy, yx;
+  SETUP_SIZE Block displacement(const Vec<2>& p, const Vec<2>& s, double radius) const {
+    Block K;
+    displacement(p[0] - s[0], p[1] - surface, depth(s, radius), radius, K.v);
+    return K;
+  }
+  /// The same for one point or a lane of them: dx beside a force at depth c, y below the top.
+  template <class Number>
+  ECHOSPLINE_INLINE void displacement(Number dx, double y, double c, double radius, Number (&K)[2][2]) const {
+    Number xx, yy, xy, yx;
     kelvin(dx, y - c, radius, xx, yy, xy);
     yx = xy;
     if (top == Surface::sliding) {
-      double mxx, myy, mxy;
+      Number mxx, myy, mxy;
       kelvin(dx, y + c, radius, mxx, myy, mxy);
       xx += mxx, yy -= myy, xy -= mxy, yx += mxy;
     } else if (top != Surface::none) {
       image(dx, y, c, radius, xx, yy, xy, yx);
     }
     const double k = scale();
-    return {{{k * xx, k * xy}, {k * yx, k * yy}}};
+    K[0][0] = k * xx, K[0][1] = k * xy, K[1][0] = k * yx, K[1][1] = k * yy;
+  }
+  double depth(const Vec<2>& s, double radius) const {
+    const double c = s[1] - surface;
+    return top == Surface::free || top == Surface::clamped ? std::fmax(c, SHALLOWEST * radius) : c;
   }
 
   /// Traction times thickness on a unit normal at p by unit forces at s, 1/mm.
@@ -74,40 +104,41 @@ struct HalfPlane {
   int motions() const { return top == Surface::sliding ? 1 : top == Surface::clamped ? 0 : 3; }
 
  private:
-  double depth(const Vec<2>& s, double radius) const {
-    const double c = s[1] - surface;
-    return top == Surface::free || top == Surface::clamped ? std::fmax(c, SHALLOWEST * radius) : c;
-  }
-
   /// A blob in the endless plane, times 8 pi mu (1 - nu).
-  void kelvin(double dx, double dy, double radius, double& xx, double& yy, double& xy) const {
-    const double e2 = radius * radius, inverse = 1 / (dx * dx + dy * dy + e2), x = dx * inverse;
-    const double diagonal = 0.5 * (3 - 4 * nu) * std::log(inverse) + 2 * (1 - nu) * e2 * inverse;
-    xx = diagonal + dx * x, yy = diagonal + dy * dy * inverse, xy = dy * x;
+  template <class Number>
+  ECHOSPLINE_INLINE void kelvin(Number dx, double dy, double radius, Number& xx, Number& yy, Number& xy) const {
+    const double e2 = radius * radius;
+    const Number inverse = 1.0 / (dx * dx + (dy * dy + e2)), x = dx * inverse;
+    const Number diagonal = (0.5 * (3 - 4 * nu)) * logarithm(inverse) + (2 * (1 - nu) * e2) * inverse;
+    xx = diagonal + dx * x, yy = diagonal + (dy * dy) * inverse, xy = dy * x;
   }
 
   /// Add the image above a free or clamped top.
-  void image(double dx, double y, double c, double radius, double& xx, double& yy, double& xy, double& yx) const {
-    const double a = 3 - 4 * nu, Y = y + c, inverse = 1 / (dx * dx + Y * Y);
-    const double x = dx * inverse, d = Y * inverse;  // 1 / w = x - i d
-    const double even = x * x - d * d, odd = 2 * x * d, cy = 2 * c * y;
-    double b, both, swap;
+  template <class Number>
+  ECHOSPLINE_INLINE void image(Number dx, double y, double c, double radius, Number& xx, Number& yy, Number& xy,
+                               Number& yx) const {
+    const double a = 3 - 4 * nu, Y = y + c, cy = 2 * c * y;
+    const Number inverse = 1.0 / (dx * dx + Y * Y);
+    const Number x = dx * inverse, d = Y * inverse;  // 1 / w = x - i d
+    const Number even = x * x - d * d, odd = 2.0 * x * d;
+    double b;
+    Number both, swap;
     if (top == Surface::free) {
       b = -1;
-      const double log = 0.25 * (a * a + 1) * std::log(inverse);
-      both = a * dx * (y - c) * inverse;
-      swap = cy * odd - 4 * (1 - nu) * (1 - 2 * nu) * std::atan2(dx, Y);
-      xx += log + a * dx * x - cy * even, yy += log + a * Y * d - cy * even;
+      const Number log = (0.25 * (a * a + 1)) * logarithm(inverse);
+      both = (a * (y - c)) * x;
+      swap = cy * odd - (4 * (1 - nu) * (1 - 2 * nu)) * arctangent(dx * (1 / Y));
+      xx += log + a * dx * x - cy * even, yy += log + (a * Y) * d - cy * even;
     } else {
       b = a;
-      const double log = -0.5 * a * std::log(inverse);
-      both = -(y - c) * x, swap = -(cy / a) * odd;
+      const Number log = (-0.5 * a) * logarithm(inverse);
+      both = (c - y) * x, swap = (-cy / a) * odd;
       xx += log - dx * x + (cy / a) * even, yy += log - Y * d + (cy / a) * even;
     }
     xy += both + swap, yx += both - swap;
     if (radius == 0) return;
     const double share = radius * radius / (2 * b);
-    const double up = 4 * y * (even * d + odd * x), side = 4 * y * (even * x - odd * d);
+    const Number up = (4 * y) * (even * d + odd * x), side = (4 * y) * (even * x - odd * d);
     xx += share * (a * even - up), yy -= share * (a * even + up);
     xy -= share * (a * odd + side), yx -= share * (a * odd - side);
   }

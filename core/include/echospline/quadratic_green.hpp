@@ -55,8 +55,8 @@ class QuadraticGreen {
   /// Numbers that `solve` works in.
   int64_t solve_room() const { return 2 * largest_; }
 
-  /// Add a force to a load, (nodes, 2).
-  void add_load(const GreenForce& f, double* load) const {
+  /// Add a force to two loads, (nodes, 2).
+  void add_load(const GreenForce& f, double* a, double* b) const {
     for (int k = 0; k < RING_POINTS; ++k) {
       const double angle = CIRCLE / 6 * k + (k < 6 ? 0 : CIRCLE / 12), r = radius_ * RINGS[k / 6];
       Vec<2> p = f.place + Vec<2>{{r * std::cos(angle), r * std::sin(angle)}};
@@ -64,7 +64,10 @@ class QuadraticGreen {
       const SixNodes at = locate(p);
       for (int i = 0; i < 6; ++i)
         for (int d = 0; d < 2; ++d)
-          if (!held_[2 * at.node[i] + d]) load[2 * at.node[i] + d] += at.weight[i] / RING_POINTS * f.force[d];
+          if (const int64_t k = 2 * at.node[i] + d; !held_[k]) {
+            a[k] += at.weight[i] / RING_POINTS * f.force[0][d];
+            b[k] += at.weight[i] / RING_POINTS * f.force[1][d];
+          }
     }
   }
 
@@ -96,7 +99,7 @@ class QuadraticGreen {
       for (int64_t j = part.own; j-- > 0;) {
         const int64_t n = part.all - j;
         column -= n;
-        double s = 0, t = 0;
+        double s, t;
         two_products(column + 1, p + j + 1, q + j + 1, n - 1, s, t);
         p[j] = (p[j] - s) * column[0], q[j] = (q[j] - t) * column[0];
       }
@@ -330,18 +333,6 @@ class QuadraticGreen {
 
   static void gather(const Part& part, const int32_t* index, const double* a, const double* b, double* p, double* q) {
     for (int64_t i = 0; i < part.all; ++i) p[i] = a[index[i]], q[i] = b[index[i]];
-  }
-
-  /// Sums of products of a column with two others, in lanes.
-  static void two_products(const double* l, const double* p, const double* q, int64_t n, double& s, double& t) {
-    Doubles S = {}, T = {};
-    int64_t i = 0;
-    for (; i + DOUBLE_LANES <= n; i += DOUBLE_LANES) {
-      const Doubles c = load(l + i);
-      S += c * load(p + i), T += c * load(q + i);
-    }
-    for (int k = 0; k < DOUBLE_LANES; ++k) s += S[k], t += T[k];
-    for (; i < n; ++i) s += l[i] * p[i], t += l[i] * q[i];
   }
 };
 

@@ -103,6 +103,102 @@ ECHOSPLINE_API echospline_status echospline_volume_trace_tissue(echospline_volum
                                                                 int64_t count, const double* tip, double close,
                                                                 double* lattice, echospline_trace_report* report);
 
+/* ---- Tissue in space under a needle's forces ---------------------------------------------------------------------- */
+
+/* The law of echospline_forced in space. Homogeneous tissue is answered by the core from tables (mechanics/space_response.py makes them, in
+ * Python); with source_count 0 the host answers, one station of the track at a time, as in the plane:
+ *
+ *     while ((status = echospline_spatial_advance(spatial, &pose)) == ECHOSPLINE_NEEDS_STATION) {
+ *       echospline_spatial_wanted(spatial, &station);
+ *       ... rows: displacement by its forces at the stations so far ...
+ *       echospline_spatial_answer(spatial, rows, count);
+ *     } */
+
+typedef struct echospline_spatial_options {
+  uint32_t struct_size;
+  int32_t level;
+  double low[3], high[3]; /* least and greatest corner of the tissue, mm; with a surface low[1] is 0 */
+  double tip, friction_limit, bond, tip_stiffness, side_stiffness, viscosity; /* as in echospline_forced_options */
+  double station_spacing, substep, dead_band;
+  int32_t top;      /* ECHOSPLINE_TOP_NONE where the face y = low[1] is held by boundary forces, as the others are */
+  uint32_t clamped; /* faces, bits of ECHOSPLINE_LEFT ...; others are free or slide */
+  uint32_t sliding;
+  int32_t reserved;
+  double poisson, shear_modulus, radius; /* -, N/mm^2; over which a force of the needle is spread, mm */
+  double source_radius;                  /* over which a boundary force is spread, mm */
+  double traction_length;                /* weight of a traction over the shear modulus among displacements, mm */
+  const double* sources;                 /* (source_count, 3) places of the boundary forces, mm */
+  int64_t source_count;
+  const double* conditions;        /* (condition_count, 3) points on the faces, mm */
+  const uint32_t* condition_faces; /* (condition_count) the face of each */
+  int64_t condition_count;
+  const double* answers; /* (3 * source_count + motions, 3 * condition_count): boundary forces, N, and rigid motions (6, or shifts
+                            along x and z and the turn about y under a sliding top) by what the needle does to the conditions */
+  int64_t answer_count;  /* numbers of it */
+  int32_t lattice_shape[3]; /* of the lattice that carries what the faces do, 4 or more points each */
+  int32_t lattice_reserved;
+  double lattice_spacing[3], lattice_origin[3]; /* mm */
+} echospline_spatial_options;
+
+typedef struct echospline_spatial_station {
+  int64_t index;       /* along the track, 0 at the surface */
+  double place[3];     /* in the undeformed tissue, mm */
+  double axis[3];      /* of the needle when the tip cut there */
+  double points[12];   /* (point_count, 3) mm: where the station's force acts */
+  double weights[4];   /* share of the force at each point; they add up to 1 */
+  int32_t point_count; /* 0 to 4; 0: outside the tissue, its rows are zero */
+  int32_t reserved;
+} echospline_spatial_station;
+
+typedef struct echospline_spatial_load {
+  double tip;       /* of the tip along the axis, N, zero or more */
+  double friction;  /* sum along the axis, N; negative on withdrawal */
+  double side;      /* size of the sum across the axis, N */
+  double cut;       /* length of track cut so far, mm */
+  double force[3];  /* of all, N */
+  double torque[3]; /* of all about the entry, N mm */
+} echospline_spatial_load;
+
+typedef struct echospline_spatial echospline_spatial;
+
+/* Fill options with the law's usual numbers. Corners have to be set, and what answers, if the core shall. */
+ECHOSPLINE_API void echospline_spatial_defaults(echospline_spatial_options* options);
+/* A forced tissue in space at rest. The tables are copied. */
+ECHOSPLINE_API echospline_status echospline_spatial_create(const echospline_spatial_options* options,
+                                                           echospline_spatial** spatial);
+ECHOSPLINE_API void echospline_spatial_destroy(echospline_spatial* spatial);
+ECHOSPLINE_API const char* echospline_spatial_message(const echospline_spatial* spatial);
+
+/* Back to rest: tissue that no needle has touched. Answers are kept. */
+ECHOSPLINE_API echospline_status echospline_spatial_reset(echospline_spatial* spatial);
+/* Advance by one step: the needle has moved to pose in pose->dt seconds. The pose's speed is not read. */
+ECHOSPLINE_API echospline_status echospline_spatial_advance(echospline_spatial* spatial, const echospline_pose* pose);
+/* The station that the last call needs. */
+ECHOSPLINE_API echospline_status echospline_spatial_wanted(echospline_spatial* spatial,
+                                                           echospline_spatial_station* station);
+/* Answer it: rows (index + 1, 3, 3): [station, component, direction of the force], mean displacement over the stations before it and, last,
+ * itself, mm/N. Copied. */
+ECHOSPLINE_API echospline_status echospline_spatial_answer(echospline_spatial* spatial, const double* rows,
+                                                           int64_t count);
+/* Forces of the present state. */
+ECHOSPLINE_API echospline_status echospline_spatial_needle(echospline_spatial* spatial, echospline_spatial_load* load);
+/* Force at each of the present state's stations, (stations, 3) N; `count` is set to the stations' number, and no more than `room` forces are
+ * written. */
+ECHOSPLINE_API echospline_status echospline_spatial_forces(echospline_spatial* spatial, double* forces, int64_t room,
+                                                           int64_t* count);
+/* Where they act: the present state's stations. `count` is set to their number, and no more than `room` are written. */
+ECHOSPLINE_API echospline_status echospline_spatial_stations(echospline_spatial* spatial,
+                                                             echospline_spatial_station* stations, int64_t room,
+                                                             int64_t* count);
+/* Displacement of the present state, where the core answers: `field` is filled, and points into the tissue until its next call. */
+ECHOSPLINE_API echospline_status echospline_spatial_field(echospline_spatial* spatial, echospline_force_field* field);
+
+/* States as bytes, as those of a tissue. They hold the track and the forces, not the answers. */
+ECHOSPLINE_API int64_t echospline_spatial_state_size(const echospline_spatial* spatial);
+ECHOSPLINE_API echospline_status echospline_spatial_state_save(echospline_spatial* spatial, void* bytes, int64_t size);
+ECHOSPLINE_API echospline_status echospline_spatial_state_load(echospline_spatial* spatial, const void* bytes,
+                                                               int64_t size);
+
 #ifdef __cplusplus
 }
 #endif

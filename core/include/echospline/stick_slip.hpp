@@ -1,9 +1,11 @@
-// A needle that sticks, slips and cuts, in the plane: forces on tissue whose answer to a point of the track is supplied from outside.
+// A needle that sticks, slips and cuts, in the plane (D = 2) or in space (D = 3): forces on tissue whose answer to a point of the track is
+// supplied from outside.
 //
 // The law is that of `mechanics/stick_slip.py`, with the same names. `SlipTissue` keeps what the tissue answers to each station:
 // the displacement of the mesh by unit forces there (columns, single precision), and the mean displacement over the stations before
 // it (rows). A step that needs a station which has no answer yet stops; once `answer` has supplied it the same step goes on. A
-// supplier inside the core would call `answer` itself.
+// supplier inside the core would call `answer` itself. Across the axis lie D - 1 units, the *frame*; in space it turns with the axis along
+// the great circle, so that a side force stays the side stiffness times the gap as a vector, whichever way the needle is tilted.
 #pragma once
 #include <cmath>
 #include <cstdint>
@@ -31,28 +33,34 @@ constexpr int MOST_CHANGES = 20;          // one at a time, per unknown
 constexpr int MOST_SWEEPS = 2000;         // if rounding keeps those from ending
 
 /// Parameters of the law; units as in `echospline_force_options`.
-struct SlipLaw {
+template <int D>
+struct SlipLawIn {
   double tip, friction_limit, bond, tip_stiffness, side_stiffness, viscosity, spacing, substep, dead_band;
-  double low[2], high[2];  ///< corners of the tissue, mm
+  double low[D], high[D];  ///< corners of the tissue, mm
 };
 
 /// A material point of the track and its load: a hat over two spacings, as point forces where there is tissue.
-struct SlipStation {
-  Vec<2> place, axis, points[4];
+template <int D>
+struct SlipStationIn {
+  Vec<D> place, axis, points[4];
   double weights[4];
   double before, share;  ///< part of the hat before the first point in the tissue, and in the tissue
   int count;             ///< of points
 };
 
-inline bool in_tissue(const SlipLaw& law, const Vec<2>& p) {
-  return p[0] >= law.low[0] && p[0] <= law.high[0] && p[1] >= law.low[1] && p[1] <= law.high[1];
+template <int D>
+inline bool in_tissue(const SlipLawIn<D>& law, const Vec<D>& p) {
+  for (int d = 0; d < D; ++d)
+    if (!(p[d] >= law.low[d] && p[d] <= law.high[d])) return false;
+  return true;
 }
 
-inline SlipStation station_at(const SlipLaw& law, const Vec<2>& place, const Vec<2>& axis) {
+template <int D>
+inline SlipStationIn<D> station_at(const SlipLawIn<D>& law, const Vec<D>& place, const Vec<D>& axis) {
   static const double at[4] = {-0.75, -0.25, 0.25, 0.75}, part[4] = {0.125, 0.375, 0.375, 0.125};
-  SlipStation s = {place, axis, {}, {}, 0, 0, 0};
+  SlipStationIn<D> s = {place, axis, {}, {}, 0, 0, 0};
   for (int i = 0; i < 4; ++i) {
-    const Vec<2> p = place + law.spacing * at[i] * axis;
+    const Vec<D> p = place + law.spacing * at[i] * axis;
     if (!in_tissue(law, p)) {
       if (s.count == 0) s.before += part[i];
       continue;
@@ -192,43 +200,97 @@ class BoxProgramme {
 };
 
 /// A station of a state.
-struct SlipContact {
-  Vec<2> place, axis;
-  double friction, side, covered;  ///< N, N, mm
-  Vec<2> moved;                    ///< displacement, mm
+template <int D>
+struct SlipContactIn {
+  Vec<D> place, axis;
+  double friction, side[D - 1], covered;  ///< N, N along each of the frame, mm
+  Vec<D> moved;                           ///< displacement, mm
 };
 
+/// Units across an axis, at right angles to each other.
+template <int D>
+struct SlipFrame {
+  Vec<D> n[D - 1];
+};
+inline Vec<2> normal_of(const Vec<2>& a) { return {{-a[1], a[0]}}; }
+inline Vec<3> cross(const Vec<3>& a, const Vec<3>& b) {
+  return {{a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]}};
+}
+inline SlipFrame<2> frame_of(const Vec<2>& axis) { return {{normal_of(axis)}}; }
+/// In space any two units will do: the first lies across the coordinate that the axis has least of.
+inline SlipFrame<3> frame_of(const Vec<3>& axis) {
+  Vec<3> least = {};
+  int at = 0;
+  for (int d = 1; d < 3; ++d)
+    if (std::fabs(axis[d]) < std::fabs(axis[at])) at = d;
+  least[at] = 1;
+  Vec<3> first = cross(axis, least);
+  first = (1 / norm(first)) * first;
+  return {{first, cross(axis, first)}};
+}
+/// Frame after the axis has turned: about the line at right angles to both, and not about itself.
+inline SlipFrame<2> turned(const SlipFrame<2>&, const Vec<2>&, const Vec<2>& axis) { return frame_of(axis); }
+inline SlipFrame<3> turned(const SlipFrame<3>& frame, const Vec<3>& before, const Vec<3>& axis) {
+  if (axis[0] == before[0] && axis[1] == before[1] && axis[2] == before[2]) return frame;
+  Vec<3> first = frame.n[0] - dot(frame.n[0], axis) / (1 + dot(before, axis)) * (before + axis);
+  first = first - dot(first, axis) * axis;  // rounding does not add up
+  first = (1 / norm(first)) * first;
+  return {{first, cross(axis, first)}};
+}
+/// Axis that has turned from one to another by a share of the angle between them.
+inline Vec<2> between(const Vec<2>& start, const Vec<2>& end, double share) {
+  const double first = std::atan2(start[1], start[0]), pi = 3.14159265358979323846;
+  double turn = std::fmod(std::atan2(end[1], end[0]) - first + pi, 2 * pi);
+  turn = (turn < 0 ? turn + 2 * pi : turn) - pi;
+  const double angle = first + share * turn;
+  return {{std::cos(angle), std::sin(angle)}};
+}
+inline Vec<3> between(const Vec<3>& start, const Vec<3>& end, double share) {
+  const double cosine = dot(start, end), angle = std::acos(std::fmin(1.0, cosine));
+  const Vec<3> ahead = end - cosine * start;
+  const double length = norm(ahead);
+  if (length < SAME_AXIS * SAME_AXIS) return end;
+  return std::cos(share * angle) * start + std::sin(share * angle) / length * ahead;
+}
+
 /// What needle and tissue remember.
-struct SlipState {
+template <int D>
+struct SlipStateIn {
   bool directed = false;  ///< a pose with a direction has come
-  Vec<2> tip = {}, axis = {}, entry = {};
+  Vec<D> tip = {}, axis = {}, entry = {};
+  SlipFrame<D> frame = {};  ///< across the axis
   double depth = 0, push = 0, cut = 0;
   int64_t count = 0;
-  Array<SlipContact> contacts;
+  Array<SlipContactIn<D>> contacts;
 
-  void copy(const SlipState& other) {
-    directed = other.directed, tip = other.tip, axis = other.axis, entry = other.entry;
+  void copy(const SlipStateIn& other) {
+    directed = other.directed, tip = other.tip, axis = other.axis, entry = other.entry, frame = other.frame;
     depth = other.depth, push = other.push, cut = other.cut, count = other.count;
     for (int64_t j = 0; j < count; ++j) contacts[j] = other.contacts[j];
   }
-  void clear() { directed = false, tip = axis = entry = {}, depth = push = cut = 0, count = 0; }
+  void clear() { directed = false, tip = axis = entry = {}, frame = {}, depth = push = cut = 0, count = 0; }
 };
 
-inline Vec<2> normal_of(const Vec<2>& a) { return {{-a[1], a[0]}}; }
-inline bool same(const Vec<2>& a, const Vec<2>& b) { return a[0] == b[0] && a[1] == b[1]; }
+template <int D>
+inline bool same(const Vec<D>& a, const Vec<D>& b) {
+  for (int d = 0; d < D; ++d)
+    if (a[d] != b[d]) return false;
+  return true;
+}
 
 /// Needle and tissue: a state, the stations' answers, and the room in which a step works.
-class SlipTissue {
+template <int D>
+class SlipTissueIn {
  public:
   enum Outcome { done, no_memory, not_solved, needs_station };
 
-  const SlipLaw law;
+  const SlipLawIn<D> law;
   const int64_t nodes;
-  SlipState state;
-  SlipStation wanted = {};  ///< station that a call has asked for
+  SlipStateIn<D> state;
+  SlipStationIn<D> wanted = {};  ///< station that a call has asked for
   int64_t wanted_index = -1;
 
-  SlipTissue(const SlipLaw& given, int64_t node_count) : law(given), nodes(node_count) {}
+  SlipTissueIn(const SlipLawIn<D>& given, int64_t node_count) : law(given), nodes(node_count) {}
   bool build() { return make_room(8); }
 
   void rest() {
@@ -238,46 +300,42 @@ class SlipTissue {
 
   /// The needle has moved to a pose in pose.dt seconds.
   Outcome advance(const echospline_pose& pose) {
-    const Vec<2> entry = point_of<2>(pose.entry), tip = point_of<2>(pose.tip);
+    const Vec<D> entry = point_of<D>(pose.entry), tip = point_of<D>(pose.tip);
     if (!(pending_ && same(entry, pending_entry_) && same(tip, pending_tip_) && pose.dt == pending_dt_)) {
       work_.copy(state);
       next_ = 1;
     }
     pending_ = false, wanted_index = -1;
-    const Vec<2> along = tip - entry;
+    const Vec<D> along = tip - entry;
     const double depth = norm(along);
     if (depth < NO_LENGTH) {  // it has no direction and touches nothing
       release(state);
       state.tip = tip, state.entry = entry, state.depth = 0;
       return done;
     }
-    Vec<2> axis = (1 / depth) * along;
+    Vec<D> axis = (1 / depth) * along;
     const bool anew = !state.directed || dot(state.axis, axis) < 0;  // the first, or drawn out and turned
-    const bool straight =
-        anew || (std::fabs(axis[0] - state.axis[0]) < SAME_AXIS && std::fabs(axis[1] - state.axis[1]) < SAME_AXIS);
+    const bool straight = anew || alike(axis, state.axis);
     if (straight && !anew) axis = state.axis;
-    const Vec<2> from = anew ? entry : state.tip, axis0 = anew ? axis : state.axis;
+    const Vec<D> from = anew ? entry : state.tip, axis0 = anew ? axis : state.axis;
     const double depth0 = anew ? 0 : state.depth;
     if (anew && next_ == 1) {
       release(work_);
-      work_.directed = true, work_.axis = axis, work_.tip = entry, work_.depth = 0;
+      work_.directed = true, work_.axis = axis, work_.frame = frame_of(axis), work_.tip = entry, work_.depth = 0;
     }
     const double ahead = dot(tip - from, axis);
     const double held = ahead > law.dead_band ? law.dead_band : ahead < -law.dead_band ? -law.dead_band : ahead;
-    const Vec<2> acting = tip - held * axis;
+    const Vec<D> acting = tip - held * axis;
     double length = 0;
     if (state.count > 0 && !anew)
       length = std::fmax(0.0, dot(from - state.contacts[0].place - state.contacts[0].moved, axis0));
     const double travel = std::fmax(norm(acting - from), norm(acting - length * axis - from + length * axis0));
     const double parts = std::ceil(travel / law.substep - 1e-9);
     const int64_t count = parts > MOST_SLIP_SUBSTEPS ? MOST_SLIP_SUBSTEPS : parts > 1 ? static_cast<int64_t>(parts) : 1;
-    const double start = std::atan2(axis0[1], axis0[0]), pi = 3.14159265358979323846;
-    double turn = std::fmod(std::atan2(axis[1], axis[0]) - start + pi, 2 * pi);
-    turn = (turn < 0 ? turn + 2 * pi : turn) - pi;
     const double parts_count = static_cast<double>(count);
     for (; next_ <= count; ++next_) {
-      const double s = static_cast<double>(next_) / parts_count, angle = start + s * turn;
-      const Vec<2> a = straight || next_ == count ? axis : Vec<2>{{std::cos(angle), std::sin(angle)}};
+      const double s = static_cast<double>(next_) / parts_count;
+      const Vec<D> a = straight || next_ == count ? axis : between(axis0, axis, s);
       const Outcome outcome = substep(from + s * (acting - from), a, depth0 + s * (depth - depth0),
                                       travel / parts_count, pose.dt / parts_count);
       if (outcome != done) return wait(outcome, entry, tip, pose.dt);
@@ -287,19 +345,21 @@ class SlipTissue {
     return done;
   }
 
-  /// Supply the wanted station's answer. columns: (2, nodes, 2), may be nullptr where no point lies in the tissue; rows (index + 1, 2, 2).
+  /// Supply the wanted station's answer. columns: (D, nodes, D), may be nullptr where no point lies in the tissue, or where there are no
+  /// nodes; rows (index + 1, D, D).
   Outcome answer(const float* columns, const double* rows) {
     const int64_t j = wanted_index;
     if (j + 3 > room_ && !make_room(2 * room_)) return no_memory;
-    if (!rows_[j].reserve(4 * (j + 1))) return no_memory;
-    if (columns && columns_[j].size() != 4 * nodes && !columns_[j].reserve(4 * nodes)) return no_memory;
+    if (!rows_[j].reserve(D * D * (j + 1))) return no_memory;
+    if (columns && columns_[j].size() != D * D * nodes && !columns_[j].reserve(D * D * nodes)) return no_memory;
     if (columns)
-      std::memcpy(columns_[j].data(), columns, static_cast<size_t>(4 * nodes) * sizeof(float));
+      std::memcpy(columns_[j].data(), columns, static_cast<size_t>(D * D * nodes) * sizeof(float));
     else
       columns_[j].reserve(0);
-    std::memcpy(rows_[j].data(), rows, static_cast<size_t>(4 * (j + 1)) * sizeof(double));
-    double* own = &rows_[j][4 * j];
-    own[1] = own[2] = (own[1] + own[2]) / 2;
+    std::memcpy(rows_[j].data(), rows, static_cast<size_t>(D * D * (j + 1)) * sizeof(double));
+    double* own = &rows_[j][D * D * j];
+    for (int c = 0; c < D; ++c)
+      for (int d = c + 1; d < D; ++d) own[D * c + d] = own[D * d + c] = (own[D * c + d] + own[D * d + c]) / 2;
     stations_[j] = wanted;
     answers_ = j + 1;
     wanted_index = -1;
@@ -307,40 +367,57 @@ class SlipTissue {
   }
 
   int64_t answers() const { return answers_; }
-  const SlipStation& station(int64_t j) const { return stations_[j]; }
+  const SlipStationIn<D>& station(int64_t j) const { return stations_[j]; }
 
-  /// Force at every station of the state, (count, 2) N.
+  /// Share of the tip's force at a station; the front lies between two.
+  double weight_at(double cut, int64_t count, int64_t j) const {
+    int64_t first = static_cast<int64_t>(cut / law.spacing);
+    if (first > count - 2) first = count - 2;
+    const double beyond = cut / law.spacing - static_cast<double>(first);
+    return j == first ? 1 - beyond : j == first + 1 ? beyond : 0;
+  }
+  /// Force at a station of a state, N.
+  Vec<D> force_of(const SlipStateIn<D>& s, int64_t j) const {
+    const SlipContactIn<D>& contact = s.contacts[j];
+    const double along = contact.friction + (s.count > 1 ? weight_at(s.cut, s.count, j) * s.push : 0);
+    Vec<D> f = along * s.axis;
+    for (int d = 0; d < D - 1; ++d) f = f + contact.side[d] * s.frame.n[d];
+    return f;
+  }
+  /// Force at every station of the state, (count, D) N.
   void forces(double* out) const { forces_of(state, out); }
 
-  void load(echospline_needle_load& out) const {
+  void load(echospline_needle_load& out) const
+    requires(D == 2)
+  {
     out.tip = state.push, out.cut = state.cut, out.friction = out.side = out.torque = 0;
     for (int64_t j = 0; j < state.count; ++j) {
-      const SlipContact& contact = state.contacts[j];
-      const Vec<2> f = force_of(state, j), arm = contact.place + contact.moved - state.entry;
-      out.friction += contact.friction, out.side += contact.side;
+      const SlipContactIn<D>& contact = state.contacts[j];
+      const Vec<D> f = force_of(state, j), arm = contact.place + contact.moved - state.entry;
+      out.friction += contact.friction, out.side += contact.side[0];
       out.torque += arm[0] * f[1] - arm[1] * f[0];
     }
   }
 
-  /// Displacement of the mesh nodes, (nodes, 2) mm: columns times forces.
+  /// Displacement of the mesh nodes, (nodes, D) mm: columns times forces.
   template <class Number>
   Outcome displacement(Number* out) {
     constexpr int64_t BLOCK = 2048;
     float sum[BLOCK];
     int64_t used = 0;
     for (int64_t j = 0; j < state.count; ++j) {
-      const Vec<2> f = force_of(state, j);
-      if (f[0] == 0 && f[1] == 0) continue;
+      const Vec<D> f = force_of(state, j);
+      if (same(f, Vec<D>{})) continue;
       if (used == 0) {
         const Outcome missing = answered(state);
         if (missing != done) return missing;
       }
       if (stations_[j].count == 0) continue;
-      for (int d = 0; d < 2; ++d)
-        if (f[d] != 0) factor_[used] = static_cast<float>(f[d]), column_[used++] = columns_[j].data() + d * 2 * nodes;
+      for (int d = 0; d < D; ++d)
+        if (f[d] != 0) factor_[used] = static_cast<float>(f[d]), column_[used++] = columns_[j].data() + d * D * nodes;
     }
-    for (int64_t begin = 0; begin < 2 * nodes; begin += BLOCK) {
-      const int64_t size = begin + BLOCK < 2 * nodes ? BLOCK : 2 * nodes - begin;
+    for (int64_t begin = 0; begin < D * nodes; begin += BLOCK) {
+      const int64_t size = begin + BLOCK < D * nodes ? BLOCK : D * nodes - begin;
       for (int64_t i = 0; i < size; ++i) sum[i] = 0;
       int64_t k = 0;
       for (; k + 4 <= used; k += 4) {  // four at a time: the sum is read and written a quarter as often
@@ -375,65 +452,70 @@ class SlipTissue {
   Outcome answered_all() { return answered(state); }
 
  private:
-  SlipState work_;
+  SlipStateIn<D> work_;
   bool pending_ = false;
-  Vec<2> pending_entry_ = {}, pending_tip_ = {};
+  Vec<D> pending_entry_ = {}, pending_tip_ = {};
   double pending_dt_ = 0;
   int64_t next_ = 1, room_ = 0, answers_ = 0;
-  SlipStation stations_[MOST_STATIONS + 2] = {};
+  SlipStationIn<D> stations_[MOST_STATIONS + 2] = {};
   Array<float> columns_[MOST_STATIONS + 2];
   Array<double> rows_[MOST_STATIONS + 2];
-  float factor_[2 * MOST_STATIONS + 4] = {};
-  const float* column_[2 * MOST_STATIONS + 4] = {};
+  float factor_[D * MOST_STATIONS + 4] = {};
+  const float* column_[D * MOST_STATIONS + 4] = {};
   BoxProgramme box_;
-  Array<double> along_, across_, mixed_;  // compliance in the needle's frame, (k, k)
-  Array<double> eta_free_, gap_free_, eta_before_, gap_before_, covered_, front_, force_;
-  Array<Vec<2>> moved_;
+  Array<double> within_[D]
+                       [D];  // compliance in the needle's frame, (k, k): along direction c at i by a force along d at j
+  Array<double> free_[D],
+      before_[D];  // where the shaft is beyond and beside the stations, in tissue at rest and as it was, mm
+  Array<double> covered_, front_, force_;
+  Array<Vec<D>> moved_;
   Array<int64_t> on_;
 
   bool make_room(int64_t room) {
-    SlipState other[2];
-    SlipState* kept[2] = {&state, &work_};
+    SlipStateIn<D> other[2];
+    SlipStateIn<D>* kept[2] = {&state, &work_};
     for (int i = 0; i < 2; ++i) {
       if (!other[i].contacts.reserve(room)) return false;
       for (int64_t j = 0; j < kept[i]->count; ++j) other[i].contacts[j] = kept[i]->contacts[j];
     }
-    Array<double>* vectors[] = {&eta_free_, &gap_free_, &eta_before_, &gap_before_, &covered_, &front_};
-    for (Array<double>* v : vectors)
-      if (!v->reserve(room)) return false;
-    if (!along_.reserve(room * room) || !across_.reserve(room * room) || !mixed_.reserve(room * room) ||
-        !force_.reserve(2 * room) || !moved_.reserve(room) || !on_.reserve(room) || !box_.reserve(2 * room + 1))
+    for (int c = 0; c < D; ++c) {
+      if (!free_[c].reserve(room) || !before_[c].reserve(room)) return false;
+      for (int d = 0; d < D; ++d)
+        if (!within_[c][d].reserve(room * room)) return false;
+    }
+    if (!covered_.reserve(room) || !front_.reserve(room) || !force_.reserve(D * room) || !moved_.reserve(room) ||
+        !on_.reserve(room) || !box_.reserve(D * room + 1))
       return false;
     for (int i = 0; i < 2; ++i) kept[i]->contacts.swap(other[i].contacts);
     room_ = room;
     return true;
   }
 
-  static void release(SlipState& s) {
+  static void release(SlipStateIn<D>& s) {
     s.push = 0;
     for (int64_t j = 0; j < s.count; ++j) {
-      SlipContact& contact = s.contacts[j];
-      contact = {contact.place, contact.axis, 0, 0, 0, {}};
+      SlipContactIn<D>& contact = s.contacts[j];
+      contact = {contact.place, contact.axis, 0, {}, 0, {}};
     }
   }
 
-  Outcome wait(Outcome outcome, const Vec<2>& entry, const Vec<2>& tip, double dt) {
+  Outcome wait(Outcome outcome, const Vec<D>& entry, const Vec<D>& tip, double dt) {
     pending_ = outcome == needs_station;
     pending_entry_ = entry, pending_tip_ = tip, pending_dt_ = dt;
     return outcome;
   }
 
-  Outcome want(int64_t index, const Vec<2>& place, const Vec<2>& axis) {
+  Outcome want(int64_t index, const Vec<D>& place, const Vec<D>& axis) {
     wanted = station_at(law, place, axis), wanted_index = index;
     return needs_station;
   }
 
-  bool matches(int64_t j, const Vec<2>& place, const Vec<2>& axis) const {
+  bool matches(int64_t j, const Vec<D>& place, const Vec<D>& axis) const {
     return j < answers_ && same(stations_[j].place, place) && same(stations_[j].axis, axis);
   }
 
   /// Whether every station of a state has its answer; else asks for the first that has none.
-  Outcome answered(const SlipState& s) {
+  Outcome answered(const SlipStateIn<D>& s) {
     for (int64_t j = 0; j < s.count; ++j)
       if (!matches(j, s.contacts[j].place, s.contacts[j].axis)) return want(j, s.contacts[j].place, s.contacts[j].axis);
     return done;
@@ -441,40 +523,30 @@ class SlipTissue {
 
   /// Compliance block: displacement of station i, component c, by a unit force at j, component d; symmetric.
   double C(int64_t i, int c, int64_t j, int d) const {
-    return i <= j ? rows_[j][4 * i + 2 * c + d] : rows_[i][4 * j + 2 * d + c];
+    return i <= j ? rows_[j][D * D * i + D * c + d] : rows_[i][D * D * j + D * d + c];
   }
 
-  double weight_at(double cut, int64_t count, int64_t j) const {
-    int64_t first = static_cast<int64_t>(cut / law.spacing);
-    if (first > count - 2) first = count - 2;
-    const double beyond = cut / law.spacing - static_cast<double>(first);
-    return j == first ? 1 - beyond : j == first + 1 ? beyond : 0;
-  }
-  Vec<2> force_of(const SlipState& s, int64_t j) const {
-    const SlipContact& contact = s.contacts[j];
-    const double along = contact.friction + (s.count > 1 ? weight_at(s.cut, s.count, j) * s.push : 0);
-    return along * s.axis + contact.side * normal_of(s.axis);
-  }
-  void forces_of(const SlipState& s, double* out) const {
+  void forces_of(const SlipStateIn<D>& s, double* out) const {
     for (int64_t j = 0; j < s.count; ++j) {
-      const Vec<2> f = force_of(s, j);
-      out[2 * j] = f[0], out[2 * j + 1] = f[1];
+      const Vec<D> f = force_of(s, j);
+      for (int d = 0; d < D; ++d) out[D * j + d] = f[d];
     }
   }
 
-  Outcome substep(const Vec<2>& tip, const Vec<2>& axis, double depth, double travel, double dt) {
-    SlipState& s = work_;
+  Outcome substep(const Vec<D>& tip, const Vec<D>& axis, double depth, double travel, double dt) {
+    SlipStateIn<D>& s = work_;
     bool touching = s.push > 0;
     for (int64_t j = 0; j < s.count && !touching; ++j) touching = s.contacts[j].covered > 0;
     if (!touching) {
       if (!in_tissue(law, tip)) {
+        s.frame = turned(s.frame, s.axis, axis);
         s.tip = tip, s.axis = axis, s.depth = depth;
         return done;
       }
       if (!in_the_track(tip, axis)) {
-        const Vec<2> place = entry_of(tip, axis, depth);
+        const Vec<D> place = entry_of(tip, axis, depth);
         if (!matches(0, place, axis)) return want(0, place, axis);
-        s.contacts[0] = {place, axis, 0, 0, 0, {}};
+        s.contacts[0] = {place, axis, 0, {}, 0, {}};
         s.count = 1, s.push = s.cut = 0;
       }
     }
@@ -483,37 +555,51 @@ class SlipTissue {
     while (s.count < 2 || (static_cast<double>(s.count - 1) * law.spacing < s.cut + RUN_AHEAD * travel &&
                            stations_[s.count - 1].share > 0 && s.count < MOST_STATIONS)) {
       const int64_t j = s.count;
-      const Vec<2> place = s.contacts[j - 1].place + law.spacing * axis;
+      const Vec<D> place = s.contacts[j - 1].place + law.spacing * axis;
       if (!matches(j, place, axis)) return want(j, place, axis);
-      SlipContact next = {place, axis, 0, 0, 0, {}};
+      SlipContactIn<D> next = {place, axis, 0, {}, 0, {}};
       for (int64_t i = 0; i < j && j > 1; ++i) {
-        const Vec<2> f = force_of(s, i);
-        for (int c = 0; c < 2; ++c) next.moved[c] += C(j, c, i, 0) * f[0] + C(j, c, i, 1) * f[1];
+        const Vec<D> f = force_of(s, i);
+        for (int c = 0; c < D; ++c)
+          for (int d = 0; d < D; ++d) next.moved[c] += C(j, c, i, d) * f[d];
       }
       s.contacts[s.count++] = next;
     }
     return solve(tip, axis, depth, travel, dt);
   }
 
-  bool in_the_track(const Vec<2>& tip, const Vec<2>& axis) const {
-    const SlipState& s = work_;
+  static bool alike(const Vec<D>& a, const Vec<D>& b) {
+    for (int d = 0; d < D; ++d)
+      if (!(std::fabs(a[d] - b[d]) < SAME_AXIS)) return false;
+    return true;
+  }
+  /// Length of what lies across an axis.
+  static double beside(const Vec<D>& v, const Vec<D>& axis) {
+    const SlipFrame<D> frame = frame_of(axis);
+    double square = 0;
+    for (int d = 0; d < D - 1; ++d) square += dot(v, frame.n[d]) * dot(v, frame.n[d]);
+    return std::sqrt(square);
+  }
+
+  bool in_the_track(const Vec<D>& tip, const Vec<D>& axis) const {
+    const SlipStateIn<D>& s = work_;
     if (s.count == 0) return false;
-    Vec<2> last = s.contacts[0].place;
+    Vec<D> last = s.contacts[0].place;
     if (s.count > 1) {
       last = {};
       for (int64_t j = 0; j < s.count; ++j) last = last + weight_at(s.cut, s.count, j) * s.contacts[j].place;
     }
-    const Vec<2> n = normal_of(axis), first = s.contacts[0].place;
-    return std::fabs(dot(tip - first, n)) <= law.spacing / 2 && std::fabs(dot(tip - last, n)) <= law.spacing / 2 &&
+    const Vec<D> first = s.contacts[0].place;
+    return beside(tip - first, axis) <= law.spacing / 2 && beside(tip - last, axis) <= law.spacing / 2 &&
            dot(last - first, axis) >= 0;
   }
 
-  Vec<2> entry_of(const Vec<2>& tip, const Vec<2>& axis, double depth) const {
+  Vec<D> entry_of(const Vec<D>& tip, const Vec<D>& axis, double depth) const {
     double way = depth;
-    for (int d = 0; d < 2; ++d)
+    for (int d = 0; d < D; ++d)
       if (axis[d] != 0) way = std::fmin(way, (tip[d] - (axis[d] > 0 ? law.low[d] : law.high[d])) / axis[d]);
-    Vec<2> entry = tip - std::fmax(way, 0.0) * axis;
-    for (int d = 0; d < 2; ++d) entry[d] = std::fmin(std::fmax(entry[d], law.low[d]), law.high[d]);
+    Vec<D> entry = tip - std::fmax(way, 0.0) * axis;
+    for (int d = 0; d < D; ++d) entry[d] = std::fmin(std::fmax(entry[d], law.low[d]), law.high[d]);
     return entry;
   }
 
@@ -525,32 +611,33 @@ class SlipTissue {
     return w < LEAST_CONTACT ? 0 : w;
   }
 
-  Outcome solve(const Vec<2>& tip, const Vec<2>& axis, double depth, double travel, double dt) {
-    SlipState& s = work_;
+  Outcome solve(const Vec<D>& tip, const Vec<D>& axis, double depth, double travel, double dt) {
+    SlipStateIn<D>& s = work_;
     const int64_t k = s.count;
-    const Vec<2> n = normal_of(axis), n0 = normal_of(s.axis);
+    const SlipFrame<D> frame = turned(s.frame, s.axis, axis);
+    Vec<D> own[D] = {axis}, own0[D] = {s.axis};  // the axis, then those across; as they were
+    for (int d = 1; d < D; ++d) own[d] = frame.n[d - 1], own0[d] = s.frame.n[d - 1];
     for (int64_t j = 0; j < k; ++j)
       for (int64_t i = 0; i <= j; ++i) {
-        const double* B = &rows_[j][4 * i];
-        const double Ba[2] = {B[0] * axis[0] + B[1] * axis[1], B[2] * axis[0] + B[3] * axis[1]};
-        const double Bn[2] = {B[0] * n[0] + B[1] * n[1], B[2] * n[0] + B[3] * n[1]};
-        along_[i * k + j] = along_[j * k + i] = axis[0] * Ba[0] + axis[1] * Ba[1];
-        across_[i * k + j] = across_[j * k + i] = n[0] * Bn[0] + n[1] * Bn[1];
-        mixed_[i * k + j] = axis[0] * Bn[0] + axis[1] * Bn[1];  // along at i by a force across at j
-        mixed_[j * k + i] = n[0] * Ba[0] + n[1] * Ba[1];
+        const double* B = &rows_[j][D * D * i];
+        for (int d = 0; d < D; ++d) {
+          Vec<D> moved = {};  // by a unit force along d at j
+          for (int c = 0; c < D; ++c)
+            for (int e = 0; e < D; ++e) moved[c] += B[D * c + e] * own[d][e];
+          for (int c = 0; c < D; ++c) within_[c][d][i * k + j] = within_[d][c][j * k + i] = dot(own[c], moved);
+        }
       }
     for (int64_t j = 0; j < k; ++j) {
-      const SlipContact& contact = s.contacts[j];
-      const Vec<2> away = tip - contact.place, before = s.tip - contact.place - contact.moved;
-      eta_free_[j] = dot(away, axis), gap_free_[j] = dot(away, n);
-      eta_before_[j] = dot(before, s.axis), gap_before_[j] = dot(before, n0);
+      const SlipContactIn<D>& contact = s.contacts[j];
+      const Vec<D> away = tip - contact.place, before = s.tip - contact.place - contact.moved;
+      for (int d = 0; d < D; ++d) free_[d][j] = dot(away, own[d]), before_[d][j] = dot(before, own0[d]);
       moved_[j] = contact.moved;
     }
     const double last = static_cast<double>(k - 1) * law.spacing;
     double furthest = std::fmin(s.cut + RUN_AHEAD * travel, last), cut = s.cut, push = 0;
     double cut_before = 0, lag_before = 0;
     int64_t guessed = -1;
-    for (int j = 0; j < k; ++j) covered_[j] = cover(j, eta_free_[j] - dot(moved_[j], axis), cut);
+    for (int j = 0; j < k; ++j) covered_[j] = cover(j, free_[0][j] - dot(moved_[j], axis), cut);
     for (int repeat = 0; repeat < MOST_REPEATS; ++repeat) {
       int64_t m = 0;
       for (int64_t j = 0; j < k; ++j)
@@ -563,20 +650,22 @@ class SlipTissue {
       assemble(m, touch, dt, guessed != m);
       guessed = m;
       if (!box_.solve()) return not_solved;
-      push = box_.z[2 * m];
-      for (int64_t j = 0; j < 2 * k; ++j) force_[j] = 0;
-      for (int64_t r = 0; r < m; ++r) force_[on_[r]] = box_.z[r], force_[k + on_[r]] = box_.z[m + r];
+      push = box_.z[D * m];
+      for (int64_t j = 0; j < D * k; ++j) force_[j] = 0;
+      for (int d = 0; d < D; ++d)
+        for (int64_t r = 0; r < m; ++r) force_[d * k + on_[r]] = box_.z[d * m + r];
       double back = 0, eta_front = 0;
       for (int64_t i = 0; i < k; ++i) {
-        double a = 0, c = 0;
-        for (int64_t j = 0; j < k; ++j) {
-          const double f = force_[j] + front_[j] * push, g = force_[k + j];
-          a += along_[i * k + j] * f + mixed_[i * k + j] * g;
-          c += mixed_[j * k + i] * f + across_[i * k + j] * g;
-        }
-        moved_[i] = a * axis + c * n;
+        Vec<D> moved = {};  // in the needle's frame
+        for (int64_t j = 0; j < k; ++j)
+          for (int d = 0; d < D; ++d) {
+            const double f = d == 0 ? force_[j] + front_[j] * push : force_[d * k + j];
+            for (int c = 0; c < D; ++c) moved[c] += within_[c][d][i * k + j] * f;
+          }
+        moved_[i] = {};
+        for (int c = 0; c < D; ++c) moved_[i] = moved_[i] + moved[c] * own[c];
         back = std::fmax(back, dot(s.contacts[i].moved - moved_[i], axis));
-        eta_front += front_[i] * (eta_free_[i] - dot(moved_[i], axis));
+        eta_front += front_[i] * (free_[0][i] - dot(moved_[i], axis));
       }
       if (cut > s.cut && back > SPRING_BACK * travel)  // cut less far
         furthest = s.cut + (cut - s.cut) * SPRING_BACK * travel / back;
@@ -590,63 +679,69 @@ class SlipTissue {
       bool settled = std::fabs(front - cut) < AGREED;
       if (repeat + 1 == MOST_REPEATS) break;
       for (int64_t j = 0; j < k; ++j)
-        if (std::fabs(cover(j, eta_free_[j] - dot(moved_[j], axis), front) - covered_[j]) >= AGREED) settled = false;
+        if (std::fabs(cover(j, free_[0][j] - dot(moved_[j], axis), front) - covered_[j]) >= AGREED) settled = false;
       if (settled) break;
       cut_before = cut, lag_before = lag, cut = front;
-      for (int64_t j = 0; j < k; ++j) covered_[j] = cover(j, eta_free_[j] - dot(moved_[j], axis), cut);
+      for (int64_t j = 0; j < k; ++j) covered_[j] = cover(j, free_[0][j] - dot(moved_[j], axis), cut);
     }
     for (int64_t j = 0; j < k; ++j) {
-      SlipContact& contact = s.contacts[j];
-      contact.friction = force_[j], contact.side = force_[k + j], contact.covered = covered_[j];
-      contact.moved = moved_[j];
+      SlipContactIn<D>& contact = s.contacts[j];
+      contact.friction = force_[j], contact.covered = covered_[j], contact.moved = moved_[j];
+      for (int d = 1; d < D; ++d) contact.side[d - 1] = force_[d * k + j];
     }
-    s.tip = tip, s.axis = axis, s.depth = depth, s.push = push, s.cut = cut;
+    s.tip = tip, s.axis = axis, s.frame = frame, s.depth = depth, s.push = push, s.cut = cut;
     return done;
   }
 
   /// The quadratic programme of friction, side and tip forces; `fresh`: guess which bounds hold from the state before.
   void assemble(int64_t m, double touch, double dt, bool fresh) {
-    const SlipState& s = work_;
+    const SlipStateIn<D>& s = work_;
     const int64_t k = s.count;
-    box_.begin(2 * m + 1);
+    box_.begin(D * m + 1);
     double tip_along = 0;
     for (int64_t i = 0; i < k; ++i)
       for (int64_t j = 0; j < k; ++j)
-        if (front_[i] != 0 && front_[j] != 0) tip_along += front_[i] * along_[i * k + j] * front_[j];
+        if (front_[i] != 0 && front_[j] != 0) tip_along += front_[i] * within_[0][0][i * k + j] * front_[j];
     for (int64_t r = 0; r < m; ++r) {
       const int64_t i = on_[r];
-      const SlipContact& contact = s.contacts[i];
-      const double w = covered_[i], bond = law.bond * w, firm = law.side_stiffness * w;
-      double tip_a = 0, tip_c = 0;
-      for (int64_t j = 0; j < k; ++j)
-        if (front_[j] != 0) tip_a += along_[i * k + j] * front_[j], tip_c += mixed_[j * k + i] * front_[j];
-      for (int64_t c = 0; c < m; ++c) {
-        const int64_t j = on_[c];
-        box_.A(r, c) = along_[i * k + j];
-        box_.A(r, m + c) = box_.A(m + c, r) = mixed_[i * k + j];
-        box_.A(m + r, m + c) = across_[i * k + j];
-      }
-      box_.A(r, r) += 1 / bond, box_.A(m + r, m + r) += 1 / firm;
-      box_.A(r, 2 * m) = box_.A(2 * m, r) = tip_a, box_.A(m + r, 2 * m) = box_.A(2 * m, m + r) = tip_c;
-      const double kept = contact.covered > w ? w / contact.covered : 1;
-      box_.b[r] = kept * contact.friction / bond + eta_free_[i] - eta_before_[i];
-      box_.b[m + r] = kept * contact.side / firm + gap_free_[i] - gap_before_[i];
-      box_.high[r] = law.friction_limit * w, box_.low[r] = -box_.high[r];
-      box_.high[m + r] = HUGE_VAL, box_.low[m + r] = -HUGE_VAL;
-      box_.soft[r] = law.viscosity > 0 ? dt / (law.viscosity * w) : 0, box_.soft[m + r] = 0;
-      if (fresh) {
+      const SlipContactIn<D>& contact = s.contacts[i];
+      const double w = covered_[i], kept = contact.covered > w ? w / contact.covered : 1;
+      for (int c = 0; c < D; ++c) {
+        const int64_t row = c * m + r;
+        double by_tip = 0;
+        for (int64_t j = 0; j < k; ++j)
+          if (front_[j] != 0) by_tip += within_[c][0][i * k + j] * front_[j];
+        for (int d = 0; d < D; ++d)
+          for (int64_t q = 0; q < m; ++q) box_.A(row, d * m + q) = within_[c][d][i * k + on_[q]];
+        const double firm = (c == 0 ? law.bond : law.side_stiffness) * w;
+        const double held = c == 0 ? contact.friction : contact.side[c - 1];
+        box_.A(row, row) += 1 / firm;
+        box_.A(row, D * m) = box_.A(D * m, row) = by_tip;
+        box_.b[row] = kept * held / firm + free_[c][i] - before_[c][i];
+        box_.high[row] = c == 0 ? law.friction_limit * w : HUGE_VAL, box_.low[row] = -box_.high[row];
+        box_.soft[row] = c == 0 && law.viscosity > 0 ? dt / (law.viscosity * w) : 0;
+        if (!fresh) continue;
         const double limit = law.friction_limit * contact.covered * (1 - 1e-9);
-        box_.held[r] = contact.covered <= 0 ? 0 : contact.friction >= limit ? 1 : contact.friction <= -limit ? -1 : 0;
-        box_.held[m + r] = 0;
+        box_.held[row] = c > 0 || contact.covered <= 0 ? 0
+                         : contact.friction >= limit   ? 1
+                         : contact.friction <= -limit  ? -1
+                                                       : 0;
       }
     }
     const double pressing = law.tip_stiffness * touch;
-    box_.A(2 * m, 2 * m) = tip_along + (touch > 0 ? 1 / pressing : 1.0);
-    box_.b[2 * m] = 0;
-    for (int64_t j = 0; j < k; ++j) box_.b[2 * m] += front_[j] * eta_free_[j];
-    box_.low[2 * m] = 0, box_.high[2 * m] = law.tip * touch, box_.soft[2 * m] = 0;
-    if (fresh) box_.held[2 * m] = s.push >= law.tip * touch * (1 - 1e-9) ? 1 : s.push <= 0 ? -1 : 0;
+    box_.A(D * m, D * m) = tip_along + (touch > 0 ? 1 / pressing : 1.0);
+    box_.b[D * m] = 0;
+    for (int64_t j = 0; j < k; ++j) box_.b[D * m] += front_[j] * free_[0][j];
+    box_.low[D * m] = 0, box_.high[D * m] = law.tip * touch, box_.soft[D * m] = 0;
+    if (fresh) box_.held[D * m] = s.push >= law.tip * touch * (1 - 1e-9) ? 1 : s.push <= 0 ? -1 : 0;
   }
 };
+
+// In the plane.
+using SlipLaw = SlipLawIn<2>;
+using SlipStation = SlipStationIn<2>;
+using SlipContact = SlipContactIn<2>;
+using SlipState = SlipStateIn<2>;
+using SlipTissue = SlipTissueIn<2>;
 
 }  // namespace echospline::ECHOSPLINE_CORE

@@ -1,6 +1,6 @@
 // The core in WebAssembly: scenes, tissues, pictures and the motion of a needle, over the C interface and nothing else.
 //
-// Scenes in space: `core.volume`, `core.forceField` and `core.plane`, over space.h.
+// Scenes in space: `core.volume`, `core.forceField`, `core.spatial` and `core.plane`, over space.h.
 //
 // `load(bytes)` makes a Core from the bytes of echospline.wasm, in a page, a worker or node. Structs and enums have the names of
 // core/include/echospline/echospline.h; there are no defaults here. Handles live in the module's memory: `destroy` them, tissues first.
@@ -122,7 +122,15 @@ export const Top = Object.freeze({ TOP_NONE: 0, TOP_FREE: 1, TOP_SLIDING: 2 });
  *   background?: number
  * }} PlaneOptions
  */
-/** What moves tissue: a field, or a tissue in space. @typedef {{ fieldAt: number } | Tissue} Moving */
+/** What moves tissue: a field, a spatial tissue, or a tissue in space. @typedef {{ fieldAt: number } | Tissue} Moving */
+/**
+ * The law and the tissue, named as in echospline_spatial_options, without counts; `SpaceResponse.tables()` of the Python package writes
+ * what answers. Numbers that are not given are the law's usual ones.
+ * @typedef {Record<string, number | Numbers> & { low: Numbers, high: Numbers }} SpatialOptions
+ */
+/** A station, named as in echospline_spatial_station. @typedef {{ index: number, place: number[], axis: number[], points: number[], weights: number[], point_count: number }} SpatialStation */
+/** Answers a station where the core does not: nine numbers for each station before it and, last, itself. @typedef {(wanted: SpatialStation) => Numbers} SpatialAnswer */
+/** The needle's forces, named as in echospline_spatial_load. @typedef {{ tip: number, friction: number, side: number, cut: number, force: number[], torque: number[] }} SpatialLoad */
 /** @typedef {{ residual: number, folded: number, jacobian: number, place: number[], outside: number }} PlaneReport */
 /**
  * How tissue answers forces: members of echospline_green_options without counts, as `GreenResponse.tables()` of the Python package writes
@@ -211,6 +219,22 @@ export const LAYOUTS = Object.freeze({
   echospline_trace_report: layout([
     ["struct_size", "u32"], ["reserved", "i32"], ["residual", "f64"], ["folded", "i64"], ["jacobian", "f64"],
     ["place", "f64", 3],
+  ]),
+  echospline_spatial_options: layout([
+    ["struct_size", "u32"], ["level", "i32"], ["low", "f64", 3], ["high", "f64", 3], ["tip", "f64"], ["friction_limit", "f64"],
+    ["bond", "f64"], ["tip_stiffness", "f64"], ["side_stiffness", "f64"], ["viscosity", "f64"], ["station_spacing", "f64"],
+    ["substep", "f64"], ["dead_band", "f64"], ["top", "i32"], ["clamped", "u32"], ["sliding", "u32"], ["reserved", "i32"],
+    ["poisson", "f64"], ["shear_modulus", "f64"], ["radius", "f64"], ["source_radius", "f64"], ["traction_length", "f64"],
+    ["sources", "pointer"], ["source_count", "i64"], ["conditions", "pointer"], ["condition_faces", "pointer"],
+    ["condition_count", "i64"], ["answers", "pointer"], ["answer_count", "i64"], ["lattice_shape", "i32", 3],
+    ["lattice_reserved", "i32"], ["lattice_spacing", "f64", 3], ["lattice_origin", "f64", 3],
+  ]),
+  echospline_spatial_station: layout([
+    ["index", "i64"], ["place", "f64", 3], ["axis", "f64", 3], ["points", "f64", 12], ["weights", "f64", 4],
+    ["point_count", "i32"], ["reserved", "i32"],
+  ]),
+  echospline_spatial_load: layout([
+    ["tip", "f64"], ["friction", "f64"], ["side", "f64"], ["cut", "f64"], ["force", "f64", 3], ["torque", "f64", 3],
   ]),
   echospline_forced_options: layout([
     ["struct_size", "u32"], ["level", "i32"], ["node_count", "i64"], ["low", "f64", 2], ["high", "f64", 2],
@@ -345,6 +369,14 @@ export class Core {
   /** Point forces in elastic tissue in space. @param {ForceFieldOptions} options @returns {ForceField} */
   forceField(options) {
     return new ForceField(this, options);
+  }
+
+  /**
+   * Tissue in space at rest, under a needle that sticks, slips and cuts. Without tables `answer` has to say what the tissue answers.
+   * @param {SpatialOptions} options @param {SpatialAnswer | null} [answer] @returns {Spatial}
+   */
+  spatial(options, answer = null) {
+    return new Spatial(this, options, answer);
   }
 
   /** The picture of a plane through a volume. @param {Volume} volume @param {PlaneOptions} options @returns {PlanePicture} */
@@ -676,6 +708,7 @@ export class Forced {
 export class Green extends Forced {
   /** @param {Core} core @param {Partial<ForcedOptions>} options @param {GreenTables} tables */
   constructor(core, options, tables) {
+    checkTables(tables);
     const { shape, spacing, origin } = tables;
     const high = [0, 1].map((d) => origin[d] + spacing[d] * (shape[d] - 1));
     super(core, { ...options, node_count: shape[0] * shape[1], low: origin, high }, () => {
@@ -737,12 +770,6 @@ export class Green extends Forced {
 /** Make a response from its tables. @param {Core} core @param {GreenTables} tables @param {number} level @returns {number} handle */
 function createGreen(core, tables, level) {
   const shape = LAYOUTS.echospline_green_options;
-  const known = new Set(shape.fields.map(({ name }) => name));
-  const unknown = Object.keys(tables).filter((name) => !known.has(name));
-  if (unknown.length > 0) {
-    throw new CoreError(Status.WRONG_VALUE, `expected names of echospline_green_options; got ${unknown.join(", ")}`);
-  }
-  checkLengths(tables);
   const at = core.allocate(shape.size);
   /** @type {Record<string, number>} */
   const placed = {};
@@ -752,9 +779,6 @@ function createGreen(core, tables, level) {
     for (const [name, [count, width, type]] of Object.entries(GREEN_TABLES)) {
       const given = /** @type {Numbers | undefined} */ (tables[name]);
       if (given === undefined) continue;
-      if (given.length % width !== 0) {
-        throw new CoreError(Status.WRONG_SIZE, `expected ${width} numbers per entry of ${name}; got ${given.length}`);
-      }
       placed[name] = core.allocate(type.BYTES_PER_ELEMENT * given.length);
       new type(core.buffer, placed[name], given.length).set(given);
       if (count !== "") counts[count] = given.length / width;
@@ -768,22 +792,37 @@ function createGreen(core, tables, level) {
   }
 }
 
-/** Refuse tables that are shorter than others say: the core has no other way to know. @param {GreenTables} tables */
-function checkLengths(tables) {
-  const length = (/** @type {string} */ name) => /** @type {Numbers | undefined} */ (tables[name])?.length ?? 0;
-  const bodies = length("bodies") / 2;
-  const bands = Number(tables.band_count ?? 0);
-  const expected = [
-    ["depths", bodies > 0 ? bands + 1 : 0], ["circles", bodies > 0 ? 3 * (bodies - bands) : 0], ["source_counts", bodies],
-    ["sides", 3 * length("conditions") / 4],
-  ];
-  for (const [name, count] of /** @type {[string, number][]} */ (expected)) {
-    if (length(name) !== count) {
-      throw new CoreError(Status.WRONG_SIZE, `expected ${count} numbers of ${name}; got ${length(name)}`);
+/** Numbers of echospline_green_options that tables name, with their type; pairs are numbers per axis. */
+const GREEN_NUMBERS = Object.freeze(LAYOUTS.echospline_green_options.fields.filter(({ name, kind }) => kind !== "pointer" &&
+  (name === "band_count" || !["struct_size", "level", "reserved", "rank"].includes(name) && !name.endsWith("_count"))));
+
+/** Refuse tables that are no numbers, or shorter than others say: the core has no other way to know. @param {GreenTables} tables */
+function checkTables(tables) {
+  const refuse = (/** @type {number} */ status, /** @type {string} */ text) => {
+    throw new CoreError(status, text);
+  };
+  const known = new Set([...GREEN_NUMBERS.map(({ name }) => name), ...Object.keys(GREEN_TABLES)]);
+  const unknown = Object.keys(tables).filter((name) => !known.has(name));
+  if (unknown.length > 0) refuse(Status.WRONG_VALUE, `expected tables of echospline_green_options; got ${unknown.join(", ")}`);
+  for (const { name, kind, count } of GREEN_NUMBERS) {
+    if (tables[name] === undefined && count === 1) continue;
+    const values = count > 1 ? Array.from(/** @type {any} */ (tables[name] ?? [])) : [tables[name]];
+    const right = kind === "f64" ? Number.isFinite : Number.isSafeInteger;
+    if (values.length !== count || !values.every((value) => right(value))) {
+      refuse(Status.WRONG_VALUE, `expected ${count} ${kind === "f64" ? "finite" : "whole"} number${count > 1 ? "s" : ""} of ${name}; got ${tables[name]}`);
     }
   }
-  for (const name of ["right", "left"]) {
-    if (tables[name] !== undefined) throw new CoreError(Status.WRONG_VALUE, `expected no ${name}: the core finds it`);
+  const length = (/** @type {string} */ name) => /** @type {Numbers | undefined} */ (tables[name])?.length ?? 0;
+  for (const [name, [, width]] of Object.entries(GREEN_TABLES)) {
+    if (tables[name] === undefined || Number.isInteger(length(name) / width) && typeof tables[name] === "object") continue;
+    refuse(Status.WRONG_SIZE, `expected ${width} numbers per entry of ${name}; got ${tables[name]}`.slice(0, 200));
+  }
+  if (tables.method === GreenMethod.GREEN_SOLVE) return;
+  const bodies = length("bodies") / 2;
+  const bands = Number(tables.band_count ?? 0);
+  const expected = { depths: bands + 1, circles: 3 * (bodies - bands), source_counts: bodies, sides: 3 * length("conditions") / 4 };
+  for (const [name, count] of Object.entries(expected)) {
+    if (length(name) !== count) refuse(Status.WRONG_SIZE, `expected ${count} numbers of ${name}; got ${length(name)}`);
   }
 }
 
@@ -1139,6 +1178,165 @@ export class ForceField {
   destroy() {
     for (const at of [this.places, this.forces, this.radii, this.lattice, this.fieldAt]) this.core.functions.free(at);
     this.places = this.forces = this.radii = this.lattice = this.fieldAt = 0;
+  }
+}
+
+/** Tissue in space under a needle that sticks, slips and cuts. After `move` it may be drawn: `plane.draw(matrix, spatial, needle)`. */
+export class Spatial {
+  /** @param {Core} core @param {SpatialOptions} options @param {SpatialAnswer | null} answer */
+  constructor(core, options, answer) {
+    this.core = core;
+    this.answer = answer;
+    const { functions } = core;
+    const shape = LAYOUTS.echospline_spatial_options;
+    const known = new Set(shape.fields.map(({ name }) => name));
+    const unknown = Object.keys(options).filter((name) => !known.has(name));
+    if (unknown.length > 0) {
+      throw new CoreError(Status.WRONG_VALUE, `expected names of echospline_spatial_options; got ${unknown.join(", ")}`);
+    }
+    const numbers = (/** @type {string} */ name) => /** @type {Numbers} */ (options[name] ?? []);
+    const faces = numbers("condition_faces");
+    if (numbers("conditions").length !== 3 * faces.length || numbers("sources").length % 3 !== 0) {
+      const came = `${numbers("conditions").length}, ${faces.length} and ${numbers("sources").length}`;
+      throw new CoreError(Status.WRONG_SIZE, `expected three numbers of conditions for each of condition_faces, and of each source; got ${came}`);
+    }
+    const at = core.allocate(shape.size);
+    /** @type {Record<string, number>} */
+    const placed = {};
+    try {
+      for (const name of ["sources", "conditions", "answers"]) placed[name] = core.place(numbers(name));
+      placed.condition_faces = core.allocate(4 * faces.length);
+      new Uint32Array(core.buffer, placed.condition_faces, faces.length).set(faces);
+      const counts = { source_count: numbers("sources").length / 3, condition_count: faces.length, answer_count: numbers("answers").length };
+      core.write(at, shape, { struct_size: shape.size });
+      functions.echospline_spatial_defaults(at);
+      core.write(at, shape, { ...options, ...placed, ...counts });
+      this.handle = core.create("spatial", at);
+    } finally {
+      for (const address of [at, ...Object.values(placed)]) functions.free(address);
+    }
+    this.pose = core.allocate(LAYOUTS.echospline_pose.size);
+    /** Address of echospline_force_field, which `move` fills. */
+    this.fieldAt = core.allocate(LAYOUTS.echospline_force_field.size);
+    core.write(this.fieldAt, LAYOUTS.echospline_force_field, { struct_size: LAYOUTS.echospline_force_field.size });
+  }
+
+  /** Throw unless a call succeeded. @param {number} status */
+  check(status) {
+    this.core.check(status, "spatial", this.handle);
+  }
+
+  /** Back to rest. */
+  reset() {
+    this.check(this.core.functions.echospline_spatial_reset(this.handle));
+  }
+
+  /** Advance by one step. @param {Pose} pose */
+  advance(pose) {
+    const { functions } = this.core;
+    this.core.write(this.pose, LAYOUTS.echospline_pose, pose);
+    let status = functions.echospline_spatial_advance(this.handle, this.pose);
+    while (status === Status.NEEDS_STATION && this.answer !== null) {
+      const wanted = /** @type {any} */ (this.given("echospline_spatial_station", functions.echospline_spatial_wanted));
+      const rows = this.answer(wanted);
+      const at = this.core.place(rows);
+      try {
+        this.check(functions.echospline_spatial_answer(this.handle, at, BigInt(rows.length)));
+      } finally {
+        functions.free(at);
+      }
+      status = functions.echospline_spatial_advance(this.handle, this.pose);
+    }
+    this.check(status);
+  }
+
+  /** A struct that a function of the handle fills. @param {keyof typeof LAYOUTS} name @param {Function} call @returns {Record<string, number | number[]>} */
+  given(name, call) {
+    const at = this.core.allocate(LAYOUTS[name].size);
+    try {
+      this.check(call(this.handle, at));
+      return this.core.read(at, LAYOUTS[name]);
+    } finally {
+      this.core.functions.free(at);
+    }
+  }
+
+  /** The needle's forces. @returns {SpatialLoad} */
+  load() {
+    return /** @type {any} */ (this.given("echospline_spatial_load", this.core.functions.echospline_spatial_needle));
+  }
+
+  /** Force at every station, three numbers each, N. @returns {Float64Array} */
+  forces() {
+    const { functions } = this.core;
+    return this.listed(functions.echospline_spatial_forces, 24, (at, count) => new Float64Array(this.core.buffer, at, 3 * count).slice());
+  }
+
+  /** Where they act. @returns {SpatialStation[]} */
+  stations() {
+    const shape = LAYOUTS.echospline_spatial_station;
+    return this.listed(this.core.functions.echospline_spatial_stations, shape.size, (at, count) =>
+      Array.from({ length: count }, (_, i) => /** @type {any} */ (this.core.read(at + i * shape.size, shape))));
+  }
+
+  /** What a function writes of which there are many. @template T @param {Function} call @param {number} size @param {(at: number, count: number) => T} read @returns {T} */
+  listed(call, size, read) {
+    const { functions } = this.core;
+    const number = this.core.allocate(8);
+    let list = 0;
+    try {
+      this.check(call(this.handle, 0, 0n, number));
+      const count = Number(new BigInt64Array(this.core.buffer, number, 1)[0]);
+      list = this.core.allocate(size * count);
+      this.check(call(this.handle, list, BigInt(count), number));
+      return read(list, count);
+    } finally {
+      functions.free(number);
+      functions.free(list);
+    }
+  }
+
+  /** Find the displacement of the present state, for `displacementAt` and for drawing; where the core answers. @returns {Spatial} */
+  move() {
+    this.check(this.core.functions.echospline_spatial_field(this.handle, this.fieldAt));
+    return this;
+  }
+
+  /** Displacement of points in the undeformed tissue, three numbers each, mm, after `move`. @param {Numbers} points @returns {Float64Array} */
+  displacementAt(points) {
+    return displacementOf(this.core, this.fieldAt, points);
+  }
+
+  /** The present state as bytes. @returns {Uint8Array} */
+  save() {
+    const { functions } = this.core;
+    const size = Number(functions.echospline_spatial_state_size(this.handle));
+    const at = this.core.allocate(size);
+    try {
+      this.check(functions.echospline_spatial_state_save(this.handle, at, BigInt(size)));
+      return new Uint8Array(this.core.buffer, at, size).slice();
+    } finally {
+      functions.free(at);
+    }
+  }
+
+  /** Make saved bytes the present state. @param {Uint8Array} bytes */
+  restore(bytes) {
+    const { functions } = this.core;
+    const at = this.core.allocate(bytes.length);
+    try {
+      new Uint8Array(this.core.buffer, at, bytes.length).set(bytes);
+      this.check(functions.echospline_spatial_state_load(this.handle, at, BigInt(bytes.length)));
+    } finally {
+      functions.free(at);
+    }
+  }
+
+  destroy() {
+    const { functions } = this.core;
+    functions.echospline_spatial_destroy(this.handle);
+    for (const at of [this.pose, this.fieldAt]) functions.free(at);
+    this.handle = this.pose = this.fieldAt = 0;
   }
 }
 

@@ -83,6 +83,73 @@ class TraceReport(ctypes.Structure):
     ]
 
 
+class SpatialOptions(ctypes.Structure):
+    """echospline_spatial_options."""
+
+    _fields_ = [
+        ("struct_size", c_uint32),
+        ("level", c_int32),
+        ("low", c_double * 3),
+        ("high", c_double * 3),
+        ("tip", c_double),
+        ("friction_limit", c_double),
+        ("bond", c_double),
+        ("tip_stiffness", c_double),
+        ("side_stiffness", c_double),
+        ("viscosity", c_double),
+        ("station_spacing", c_double),
+        ("substep", c_double),
+        ("dead_band", c_double),
+        ("top", c_int32),
+        ("clamped", c_uint32),
+        ("sliding", c_uint32),
+        ("reserved", c_int32),
+        ("poisson", c_double),
+        ("shear_modulus", c_double),
+        ("radius", c_double),
+        ("source_radius", c_double),
+        ("traction_length", c_double),
+        ("sources", c_void_p),
+        ("source_count", c_int64),
+        ("conditions", c_void_p),
+        ("condition_faces", c_void_p),
+        ("condition_count", c_int64),
+        ("answers", c_void_p),
+        ("answer_count", c_int64),
+        ("lattice_shape", c_int32 * 3),
+        ("lattice_reserved", c_int32),
+        ("lattice_spacing", c_double * 3),
+        ("lattice_origin", c_double * 3),
+    ]
+
+
+class SpatialStation(ctypes.Structure):
+    """echospline_spatial_station."""
+
+    _fields_ = [
+        ("index", c_int64),
+        ("place", c_double * 3),
+        ("axis", c_double * 3),
+        ("points", c_double * 12),
+        ("weights", c_double * 4),
+        ("point_count", c_int32),
+        ("reserved", c_int32),
+    ]
+
+
+class SpatialLoad(ctypes.Structure):
+    """echospline_spatial_load."""
+
+    _fields_ = [
+        ("tip", c_double),
+        ("friction", c_double),
+        ("side", c_double),
+        ("cut", c_double),
+        ("force", c_double * 3),
+        ("torque", c_double * 3),
+    ]
+
+
 FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {  # name: result, arguments; handles and arrays are addresses
     "echospline_volume_create": (c_int32, [POINTER(VolumeOptions), c_void_p, POINTER(c_void_p)]),
     "echospline_volume_destroy": (None, [c_void_p]),
@@ -120,6 +187,21 @@ FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {  # name: result, arguments; hand
         ],
     ),
     "echospline_force_field_at": (c_int32, [POINTER(ForceField), c_void_p, c_int64, c_void_p]),
+    "echospline_spatial_defaults": (None, [POINTER(SpatialOptions)]),
+    "echospline_spatial_create": (c_int32, [POINTER(SpatialOptions), POINTER(c_void_p)]),
+    "echospline_spatial_destroy": (None, [c_void_p]),
+    "echospline_spatial_message": (c_char_p, [c_void_p]),
+    "echospline_spatial_reset": (c_int32, [c_void_p]),
+    "echospline_spatial_advance": (c_int32, [c_void_p, POINTER(_native.Pose)]),
+    "echospline_spatial_wanted": (c_int32, [c_void_p, POINTER(SpatialStation)]),
+    "echospline_spatial_answer": (c_int32, [c_void_p, c_void_p, c_int64]),
+    "echospline_spatial_needle": (c_int32, [c_void_p, POINTER(SpatialLoad)]),
+    "echospline_spatial_forces": (c_int32, [c_void_p, c_void_p, c_int64, POINTER(c_int64)]),
+    "echospline_spatial_stations": (c_int32, [c_void_p, c_void_p, c_int64, POINTER(c_int64)]),
+    "echospline_spatial_field": (c_int32, [c_void_p, POINTER(ForceField)]),
+    "echospline_spatial_state_size": (c_int64, [c_void_p]),
+    "echospline_spatial_state_save": (c_int32, [c_void_p, c_void_p, c_int64]),
+    "echospline_spatial_state_load": (c_int32, [c_void_p, c_void_p, c_int64]),
 }
 
 

@@ -279,7 +279,7 @@ def _shipped(session: page_room.RecordedSession) -> page_room.Pack:
 def rescore(number: Number, kept: Kept = None) -> None:
     """Score a stored session again from its trace, and print both scores as JSON."""
     session, exercise, trace = _open(kept).load(number)
-    print(json.dumps({"stored": session.score, "now": viewer.score(trace, exercise).to_dict()}, indent=2))
+    print(json.dumps({"stored": session.score, "now": page_room.score(trace, exercise).to_dict()}, indent=2))
 
 
 @sessions.command()

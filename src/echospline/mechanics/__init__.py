@@ -8,6 +8,7 @@ if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.mechanics.anchored_kernel import AnchoredKernel
     from echospline.mechanics.fem import FEMModel
     from echospline.mechanics.force_model import ForceModel
+    from echospline.mechanics.forced_scene import ForcedScene, ForcedStep
     from echospline.mechanics.forces import Forces, NeedleForces, NeedleLoad, ViscousForces
     from echospline.mechanics.green import GreenModel
     from echospline.mechanics.kernels import Elastic, Kernel, ThinPlate
@@ -30,6 +31,8 @@ __all__ = [
     "Elastic",
     "FEMModel",
     "ForceModel",
+    "ForcedScene",
+    "ForcedStep",
     "Forces",
     "GreenModel",
     "Kernel",

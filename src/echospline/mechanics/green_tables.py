@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import weakref
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -60,10 +61,11 @@ def tables(solver: BoundaryForces | QuadraticSolve) -> dict[str, Any]:
 
 def _boundary(s: BoundaryForces) -> dict[str, Any]:
     conditions, sides = [], []
+    side: tuple[int, int, int]
     for piece in s.pieces:
         conditions.append(np.hstack([piece.points, piece.normals]))
         if len(piece.bodies) == 2:
-            side = (core.GreenCondition.CONDITION_INTERFACE, *piece.bodies)
+            side = (core.GreenCondition.CONDITION_INTERFACE, piece.bodies[0], piece.bodies[1])
         else:
             kinds = {
                 "clamped": core.GreenCondition.CONDITION_CLAMPED,
@@ -159,28 +161,79 @@ class NativeGreen:
             _native.check(status, self._core.echospline_green_message, self._handle)
 
 
+NUMBERS = tuple(
+    name
+    for name, kind in ((field[0], field[1]) for field in core.GreenOptions._fields_)
+    if name not in ("struct_size", "level", "reserved", "right", "left", *COUNTS)
+    and kind is not ctypes.c_void_p
+)
+"""Members of the options that tables may name and that are numbers, or two of them."""
+WIDTHS = dict(COUNTS.values()) | {"depths": 1, "circles": 3, "source_counts": 1, "sides": 3}
+"""Numbers per entry of every array."""
+
+
 def options_of(
-    given: dict[str, Any], factors: tuple[Floats, Floats] | None = None
+    given: Mapping[str, Any], factors: tuple[Floats, Floats] | None = None
 ) -> tuple[core.GreenOptions, list[Any]]:
-    """Options of the core from tables, and the arrays that they point to; factors: right and left, which it then need not find."""
+    """Options of the core from tables, and the arrays that they point to; factors: right and left, which it then need not find.
+
+    Raises
+    ------
+    InputError
+        If a name is unknown, a value has another form than its member, or an array is shorter than others say: the core has no
+        other way to know.
+    """
     o = core.GreenOptions(struct_size=ctypes.sizeof(core.GreenOptions))
     kept: dict[str, Any] = {}
     for name, value in given.items():
-        if isinstance(value, np.ndarray):
-            kept[name] = np.ascontiguousarray(value, dtype=TYPES.get(name, np.float64))
+        if name in WIDTHS:
+            kept[name] = _table(name, value)
             setattr(o, name, kept[name].ctypes.data)
-        elif isinstance(value, list):
-            for d, number in enumerate(value):
-                getattr(o, name)[d] = number
-        else:
-            setattr(o, name, value)
+            continue
+        if name not in NUMBERS:
+            raise InputError(
+                f"{name!r} is no table of green; expected some of {', '.join((*NUMBERS, *WIDTHS))}"
+            )
+        try:
+            if isinstance(getattr(o, name), ctypes.Array):
+                getattr(o, name)[:] = tuple(value)
+            else:
+                setattr(o, name, value)
+        except (TypeError, ValueError, OverflowError):
+            raise InputError(f"{name} of green has another form than the core's; got {value!r}") from None
+    length = {name: len(table) for name, table in kept.items()}
+    if o.method == core.GreenMethod.GREEN_BOUNDARY:
+        bodies = length.get("bodies", 0) // 2
+        expected = {
+            "depths": o.band_count + 1,
+            "circles": 3 * (bodies - o.band_count),
+            "source_counts": bodies,
+        }
+        expected["sides"] = length.get("conditions", 0) // 4 * 3
+        for name, count in expected.items():
+            if length.get(name, 0) != count:
+                raise InputError(f"{name} of green must have {count} numbers; got {length.get(name, 0)}")
     for count, (name, width) in COUNTS.items():
-        if name in kept:
-            setattr(o, count, kept[name].size // width)
+        setattr(o, count, length.get(name, 0) // width)
     if factors is not None:
         kept["right"], kept["left"] = (np.ascontiguousarray(f) for f in factors)
         o.right, o.left = kept["right"].ctypes.data, kept["left"].ctypes.data
     return o, list(kept.values())
+
+
+def _table(name: str, value: Any) -> Any:
+    """Return an array of the options, flat, of the core's type."""
+    found = np.asarray(value)
+    if found.dtype.kind not in "buif" or found.size % WIDTHS[name]:
+        raise InputError(
+            f"{name} of green must be numbers, {WIDTHS[name]} per entry; got shape {found.shape} of {found.dtype}"
+        )
+    if name in TYPES:
+        with np.errstate(invalid="ignore"):
+            whole = np.array_equal(found, found.astype(TYPES[name]))
+        if not whole:
+            raise InputError(f"{name} of green must be whole numbers")
+    return np.ascontiguousarray(found.ravel(), dtype=TYPES.get(name, np.float64))
 
 
 def _rows(points: Floats, name: str) -> Floats:

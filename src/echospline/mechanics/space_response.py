@@ -14,6 +14,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from echospline import _native as core
 from echospline._native import space
@@ -332,6 +333,31 @@ class SpaceResponse:
         fields = [self.field(places, forces[:, :, k])(points) for k in range(forces.shape[2])]
         return np.stack(fields, axis=2) if fields else np.zeros((len(points), 3, 0))
 
+    def tables(self) -> dict[str, int | float | Floats | NDArray[np.uint32]]:
+        """Return what the core needs to answer in this response's place, named as in ``echospline_spatial_options``; arrays are flat."""
+        faces = [np.full(len(points), _bit(face), dtype=np.uint32) for face, points in self.rows.items()]
+        spacing, origin, shape, _ = self._lattice
+        low, high = self.grid.corners
+        return {
+            "low": low,
+            "high": high,
+            "top": int(TOPS[self.top]),
+            "clamped": sum(_bit(face) for face, kind in self.kinds.items() if kind == "clamped"),
+            "sliding": sum(_bit(face) for face, kind in self.kinds.items() if kind == "sliding"),
+            "poisson": self.tissue.poisson,
+            "shear_modulus": self.mu,
+            "radius": self.radius,
+            "source_radius": 1e-3 * self.spacing,
+            "traction_length": TRACTION,
+            "sources": self.sources.ravel(),
+            "conditions": np.concatenate(list(self.rows.values())).ravel(),
+            "condition_faces": np.concatenate(faces),
+            "answers": self._solve.ravel(),
+            "lattice_shape": np.array(shape, dtype=np.uint32),
+            "lattice_spacing": spacing,
+            "lattice_origin": origin,
+        }
+
     def describe(self) -> str:
         """Return in one sentence how the tissue is solved."""
         surface = {
@@ -441,6 +467,12 @@ class SpaceResponse:
             lines.append(first + (share**2 if under and self.top == "free" else share) * (last - first))
         Z, Y, X = np.meshgrid(*lines[::-1], indexing="ij")
         return np.stack([X.ravel(), Y.ravel(), Z.ravel()], axis=1)
+
+
+def _bit(face: str) -> int:
+    """Bit of a face in the core."""
+    axis, side = SIDES[face]
+    return 1 << (2 * axis + int(side))
 
 
 def shear_modulus(young: float, poisson: float) -> float:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from echospline.menu import on_demand
 
 if TYPE_CHECKING:  # the menu, loaded on demand
-    from echospline.page.bundle import bundle
+    from echospline.page.bundle import assembled, bundle, core_bytes, served_page
     from echospline.page.exercise import Disc, Exercise, check_exercises, default_exercises
     from echospline.page.pack import Pack
     from echospline.page.packing import packed
@@ -23,10 +23,12 @@ __all__ = [
     "RecordedSession",
     "Score",
     "Verified",
+    "assembled",
     "beyond",
     "broken_rules",
     "bundle",
     "check_exercises",
+    "core_bytes",
     "default_exercises",
     "pack_of_page",
     "packed",
@@ -34,5 +36,6 @@ __all__ = [
     "read_sessions",
     "replay",
     "score",
+    "served_page",
     "verify",
 ]

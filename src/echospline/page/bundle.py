@@ -22,6 +22,8 @@ _STYLE_TAG, _SCRIPT_TAG = (
     '<script type="module" src="main.js"></script>',
 )
 _CHARSET = '<meta charset="utf-8">'
+SERVED = '<meta name="echospline-server" content="1">'
+"""In a page that comes from a server."""
 
 
 def bundle(pack: Pack) -> str:
@@ -37,13 +39,36 @@ def bundle(pack: Pack) -> str:
     InputError
         If the core in WebAssembly has not been built.
     """
+    html, _ = assembled(shipped, {"core": core_bytes(), "scene": pack.to_bytes()}, pack.manifest.language)
+    return html
+
+
+def served_page(language: str = "en") -> tuple[str, str]:
+    """Return the page that a server serves, without core and scene, and its policy: the page fetches them from its own server.
+
+    Parameters
+    ----------
+    language : str
+        Of the page, two letters.
+    """
+    return assembled(shipped, {}, language, served=True)
+
+
+def core_bytes() -> bytes:
+    """Return the core in WebAssembly.
+
+    Raises
+    ------
+    InputError
+        If it has not been built.
+    """
     core = files("echospline").joinpath("_native", CORE)
     if not core.is_file():
         raise InputError(
             "the page needs the core in WebAssembly, which this installation lacks: make wasm in a checkout, or install a wheel "
             "(or with ECHOSPLINE_WASM=1)"
         )
-    return assembled(shipped, {"core": core.read_bytes(), "scene": pack.to_bytes()}, pack.manifest.language)
+    return core.read_bytes()
 
 
 def shipped(name: str) -> str:
@@ -61,8 +86,10 @@ def shipped(name: str) -> str:
     raise InputError(f"the page has no file {name}")
 
 
-def assembled(read: Callable[[str], str], data: dict[str, bytes], language: str = "en") -> str:
-    """Assemble a page from its files and data.
+def assembled(
+    read: Callable[[str], str], data: dict[str, bytes], language: str = "en", *, served: bool = False
+) -> tuple[str, str]:
+    """Assemble a page from its files and data; returns it and its policy.
 
     Parameters
     ----------
@@ -72,6 +99,8 @@ def assembled(read: Callable[[str], str], data: dict[str, bytes], language: str 
         By the id of the element that holds it, deflated and in base64.
     language : str
         Of the page, two letters.
+    served : bool
+        Whether it comes from a server, which it may then ask: it says so by its ``echospline-server``.
 
     Raises
     ------
@@ -89,7 +118,10 @@ def assembled(read: Callable[[str], str], data: dict[str, bytes], language: str 
     if "</style" in style.lower():
         raise InputError("style.css may not hold </style")
     script, style = f"\n{script}", f"\n{style}"
-    meta = f'<meta http-equiv="Content-Security-Policy" content="{policy(script, style)}">'
+    rules = policy(script, style, served=served)
+    meta = f'<meta http-equiv="Content-Security-Policy" content="{rules}">'
+    if served:
+        meta += f"\n{SERVED}"
     blocks = [
         f'<script type="text/plain" id="{name}">{_base64(deflated(part))}</script>'
         for name, part in data.items()
@@ -97,11 +129,11 @@ def assembled(read: Callable[[str], str], data: dict[str, bytes], language: str 
     html = re.sub(r"<html\b[^>]*>", f'<html lang="{language}">', html, count=1)
     html = html.replace(_CHARSET, f"{_CHARSET}\n{meta}")
     html = html.replace(_STYLE_TAG, f"<style>{style}</style>")
-    return html.replace(_SCRIPT_TAG, "\n".join([*blocks, f'<script type="module">{script}</script>']))
+    return html.replace(_SCRIPT_TAG, "\n".join([*blocks, f'<script type="module">{script}</script>'])), rules
 
 
-def policy(script: str, style: str) -> str:
-    """Return the policy of a page with this inline script and style: nothing else runs, is loaded or sent."""
+def policy(script: str, style: str, *, served: bool = False) -> str:
+    """Return the policy of a page with this inline script and style: nothing else runs, is loaded or sent, but to its own server."""
     return "; ".join(
         [
             "default-src 'none'",
@@ -112,6 +144,7 @@ def policy(script: str, style: str) -> str:
             "media-src blob:",
             "base-uri 'none'",
             "form-action 'none'",
+            *(["connect-src 'self'"] if served else []),
         ]
     )
 

@@ -38,7 +38,6 @@ Field = Callable[[Floats], Floats]
 """Displacement (n, 3) mm of reference points (n, 3) mm."""
 
 
-
 @runtime_checkable
 class CoreField(Protocol):
     """A displacement that the core can sum itself: planes are then traced back there."""
@@ -191,7 +190,6 @@ class NativeVolume:
         )  # fmt: skip
         core.check(status, self._core.echospline_volume_message, self._volume)
         return out, outside.value
-
 
     def trace(
         self,

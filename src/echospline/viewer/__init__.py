@@ -1,10 +1,11 @@
-"""The live page: server, protocol, exercises, scores and stored sessions."""
+"""The server of the page that simulates, and the sessions that it keeps."""
 
 from typing import TYPE_CHECKING
 
 from echospline.menu import on_demand
 
 if TYPE_CHECKING:  # the menu, loaded on demand
+    from echospline.viewer.aside import unfinished
     from echospline.viewer.class_answers import (
         class_answer,
         curves_csv,
@@ -13,21 +14,17 @@ if TYPE_CHECKING:  # the menu, loaded on demand
         sessions_file,
         trace_csv,
     )
-    from echospline.viewer.exercise import Disc, Exercise, default_exercises
     from echospline.viewer.learning_curve import Criterion
-    from echospline.viewer.room import Settings
-    from echospline.viewer.scoring import score
     from echospline.viewer.served_scene import Scene
-    from echospline.viewer.server import announce, build_app, serve, steer
+    from echospline.viewer.server import announce, build_app, serve, steer, turn
     from echospline.viewer.sessions import Record, Session, Sessions
+    from echospline.viewer.settings import Settings
     from echospline.viewer.upload import UploadLimits
 else:
     on_demand(__name__)
 
 __all__ = [
     "Criterion",
-    "Disc",
-    "Exercise",
     "Record",
     "Scene",
     "Session",
@@ -38,12 +35,12 @@ __all__ = [
     "build_app",
     "class_answer",
     "curves_csv",
-    "default_exercises",
-    "score",
     "serve",
     "session_file",
     "sessions_csv",
     "sessions_file",
     "steer",
     "trace_csv",
+    "turn",
+    "unfinished",
 ]

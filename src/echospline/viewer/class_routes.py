@@ -9,7 +9,7 @@ import json
 import re
 import secrets
 import tempfile
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -20,7 +20,7 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
 from echospline.errors import EchosplineError, InputError
-from echospline.page import Pack, parsed_sessions, verify
+from echospline.page import parsed_sessions, verify
 from echospline.viewer.aside import Ending, aside
 from echospline.viewer.class_answers import (
     class_answer,
@@ -32,6 +32,7 @@ from echospline.viewer.class_answers import (
     trace_csv,
 )
 from echospline.viewer.learning_curve import Criterion
+from echospline.viewer.served_scene import Scene
 from echospline.viewer.sessions import Kept, Sessions
 from echospline.viewer.upload import UploadError, UploadLimits, Uploads
 from echospline.viewer.words import for_page
@@ -79,9 +80,8 @@ class Classroom:
     ----------
     sessions : Sessions
         Where they are stored.
-    scene_of : callable
-        Returns pack and upload's name (empty for the server's own scene) of the SHA-256 of a pack, or None where this server does not have it.
-        Called in a thread.
+    scene_of : coroutine function
+        Returns the scene of the SHA-256 of a pack, or None where this server does not have it.
     instructor : Instructor
         Who sees the class.
     criterion : Criterion
@@ -91,7 +91,7 @@ class Classroom:
     """
 
     sessions: Sessions
-    scene_of: Callable[[str], tuple[Pack, str] | None]
+    scene_of: Callable[[str], Awaitable[Scene | None]]
     instructor: Instructor
     criterion: Criterion = field(default_factory=Criterion)
     ending: Ending = field(default_factory=Ending)
@@ -108,7 +108,7 @@ class Classroom:
         """Turns of replays."""
         return asyncio.Semaphore(REPLAYED_AT_ONCE)
 
-    def store(self, data: bytes, owner: str) -> Kept:
+    async def store(self, data: bytes, owner: str) -> Kept:
         """Run a session that a page recorded again, and store it.
 
         Raises
@@ -116,20 +116,24 @@ class Classroom:
         InputError
             If it is no session, or one of a scene that this server does not have.
         """
-        given = parsed_sessions(data, "this session")
+        given = await aside(parsed_sessions, data, "this session")
         if len(given) != 1:
             raise InputError(f"sessions are handed in one at a time; got {len(given)}")
         (session,) = given
-        found = self.scene_of(session.scene.pack)
-        if found is None:
+        scene = await self.scene_of(session.scene.pack)
+        if scene is None:
             raise InputError(
                 "this session was recorded in a scene that this server does not have: export it, and import it with "
                 "echospline sessions import and its page"
             )
-        pack, upload = found
-        return self.sessions.keep(
-            verify(pack, session), scene=pack.manifest.title, upload=upload, owner=owner
-        )
+
+        def kept() -> Kept:
+            return self.sessions.keep(
+                verify(scene.pack, session), scene=scene.title, source=scene.source, upload=scene.upload,
+                owner=owner,
+            )  # fmt: skip
+
+        return await aside(kept)
 
 
 def class_routes(classroom: Classroom) -> list[Route]:
@@ -153,7 +157,7 @@ def class_routes(classroom: Classroom) -> list[Route]:
             path = Path(folder) / "session.json"
             await classroom.uploads.receive(request, path)
             async with classroom.replaying:
-                kept: Kept = await aside(classroom.store, await aside(path.read_bytes), _owner(key))
+                kept = await classroom.store(await aside(path.read_bytes), _owner(key))
         answer = JSONResponse(
             {
                 "number": kept.number,

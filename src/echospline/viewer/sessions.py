@@ -16,9 +16,9 @@ from pydantic import ValidationError
 from echospline.errors import InputError
 from echospline.live import Trace
 from echospline.page import Verified, beyond
-from echospline.viewer.exercise import Exercise
+from echospline.page.exercise import Exercise
+from echospline.page.scoring import Score
 from echospline.viewer.pictures import Pictures
-from echospline.viewer.scoring import Score
 from echospline.viewer.session_schema import opened, prepare, written
 
 _COLUMNS = (
@@ -196,7 +196,9 @@ class Sessions:
                 record or Record(),
             ).number  # fmt: skip
 
-    def keep(self, found: Verified, *, scene: str = "", upload: str = "", owner: str = "") -> Kept:
+    def keep(
+        self, found: Verified, *, scene: str = "", source: str = "", upload: str = "", owner: str = ""
+    ) -> Kept:
         """Store a session that a page recorded and that was run again; a session is stored once.
 
         Parameters
@@ -205,6 +207,8 @@ class Sessions:
             From `echospline.page.verify`. Its score is stored, not the page's.
         scene : str
             Title of the scene; what the page says where not given.
+        source : str
+            What the scene was made from, as JSON; empty where a page made it.
         upload : str
             Name of the uploaded picture that it was recorded in.
         owner : str
@@ -215,7 +219,7 @@ class Sessions:
             session.when, session.ended, session.examination, tuple(session.events), session.attempt, session.version,
             session.core, session.scene.pack, not found.differences, "; ".join(found.differences), session.digest, owner,
         )  # fmt: skip
-        person = (session.trainee, scene or session.scene.title, session.model, "", "", upload)
+        person = (session.trainee, scene or session.scene.title, session.model, source, "", upload)
         with self._written() as database:
             before = database.execute(
                 "SELECT id, attempt, difference FROM session WHERE digest = ?", (session.digest,)

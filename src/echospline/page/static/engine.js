@@ -1,9 +1,11 @@
 // The engine: a pack's scene in the core, stepped and drawn. It knows no document and runs in node too.
 
 import { load } from "./../../_native/echospline.js";
+import { planeMatrix, planeOptions } from "./probe.js";
 import { readPack } from "./scene.js";
 
-/** @import { Core, Picture, Pose } from "./../../_native/echospline.js" */
+/** @import { Core, Forced, Pose, Tissue } from "./../../_native/echospline.js" */
+/** @import { ProbePose } from "./probe.js" */
 /** @import { ModelEntry, Pack } from "./scene.js" */
 /** @typedef {{ entry: ArrayLike<number>, tip: ArrayLike<number> }} Hand where the hand wants the needle, mm */
 /**
@@ -13,8 +15,17 @@ import { readPack } from "./scene.js";
  */
 /**
  * What a model gives to the engine.
- * @typedef {{ reset: () => void, advance: (pose: Pose) => void, deform: (picture: Picture) => void, at: (points: number[]) => ArrayLike<number>, save: () => Uint8Array, load: (saved: Uint8Array) => void, destroy: () => void }} Solver
+ * @typedef {{ tissue: Tissue | Forced, reset: () => void, advance: (pose: Pose) => void, at: (points: number[]) => ArrayLike<number>, save: () => Uint8Array, load: (saved: Uint8Array) => void, destroy: () => void }} Solver
  */
+
+/**
+ * What shows the tissue: the deformed image, or the plane under the probe.
+ * @typedef {{
+ *   columns: number, rows: number, follow: (solver: Solver) => void, draw: (solver: Solver, plane: ProbePose | null, needle: Needle | null) => Uint8Array,
+ *   shade: (look: CoreLook) => Uint8ClampedArray
+ * }} Showing
+ */
+/** @import { GreenTables, Look as CoreLook, Needle } from "./../../_native/echospline.js" */
 
 /** dB that the grey levels of a recorded picture are taken to span. */
 export const RECORDED_RANGE = 60;
@@ -36,15 +47,12 @@ export class Engine {
     this.model = pack.models[0];
     /** @type {Pose} */
     this.pose = home(pack);
-    const { image, mesh } = pack;
-    if (!image) throw new Error("This page shows scenes in the plane; a volume needs a page of a later version.");
-    const pixels = /** @type {Uint8Array} */ (pack.array(image.pixels));
-    this.picture = core.picture({
-      columns: image.columns, rows: image.rows, spacing: image.spacing, origin: image.origin,
-      mesh_shape: mesh.shape, mesh_spacing: mesh.spacing, mesh_origin: mesh.origin,
-    }, pixels);
-    this.columns = image.columns;
-    this.rows = image.rows;
+    /** @type {Showing} */
+    this.showing = pack.volume ? planeOf(core, pack) : imageOf(core, pack);
+    this.columns = this.showing.columns;
+    this.rows = this.showing.rows;
+    /** @type {ProbePose | null} */
+    this.held = pack.probe?.pose ?? null;
     /** @type {Solver} */
     this.solver = solverOf(core, pack, this.model);
     this.stale = true; // the picture's deformation is older than the tissue's
@@ -71,6 +79,17 @@ export class Engine {
   reset(entry = this.pack.needle.entry) {
     this.solver.reset();
     this.pose = { entry: Array.from(entry), tip: Array.from(entry), speed: 0, dt: this.dt };
+    this.stale = true;
+  }
+
+  /** Where the probe is held; null in the plane. */
+  get plane() {
+    return this.held;
+  }
+
+  set plane(pose) {
+    if (!this.held || !pose || pose === this.held || pose.every((value, k) => value === this.held?.[k])) return;
+    this.held = pose;
     this.stale = true;
   }
 
@@ -128,30 +147,47 @@ export class Engine {
 
   /** The picture now, grey. @returns {Uint8Array} a view, right until the next call into the core */
   grey() {
-    if (this.stale) this.solver.deform(this.picture);
+    if (this.stale) this.showing.follow(this.solver);
     this.stale = false;
     const { entry, tip } = this.pose;
     const inside = Math.hypot(...Array.from(tip, (value, d) => value - entry[d])) >= OUT_OF_TISSUE;
-    return /** @type {Uint8Array} */ (this.picture.draw(inside ? { ...this.pack.needle.echo, entry, tip } : null));
+    return this.showing.draw(this.solver, this.held, inside ? { ...this.pack.needle.echo, entry, tip } : null);
   }
 
   /** The picture now in colour, (rows, columns, 4). @param {Look} look @returns {Uint8ClampedArray<ArrayBuffer>} a view, right until the next call into the core */
   draw({ gain, timeGain, dynamicRange, invert }) {
     if (this.stale) this.grey();
     const look = { gain, depth_gains: timeGain, dynamic_range: dynamicRange, recorded_range: RECORDED_RANGE, invert: Number(invert) };
-    return /** @type {Uint8ClampedArray<ArrayBuffer>} */ (this.picture.shade(look));
-  }
-
-  /** The last deformation's check. */
-  get report() {
-    return this.picture.report();
+    return /** @type {Uint8ClampedArray<ArrayBuffer>} */ (this.showing.shade(look));
   }
 }
 
-/** A recorded pose. @param {Float64Array} poses rows of [entry x, y, tip x, y, speed] @param {number} row @param {number} dt s @returns {Pose} */
-export function poseOf(poses, row, dt) {
-  const k = 5 * row;
-  return { entry: [poses[k], poses[k + 1]], tip: [poses[k + 2], poses[k + 3]], speed: poses[k + 4], dt };
+/** @param {Core} core @param {Pack} pack @returns {Showing} */
+function imageOf(core, { image, mesh, array }) {
+  if (!image) throw new Error("A scene has an image or a volume.");
+  const { columns, rows, spacing, origin, pixels } = image;
+  const picture = core.picture({ columns, rows, spacing, origin, mesh_shape: mesh.shape, mesh_spacing: mesh.spacing, mesh_origin: mesh.origin }, /** @type {Uint8Array} */ (array(pixels)));
+  return {
+    columns, rows, follow: ({ tissue }) => picture.follow(tissue), draw: (_, __, needle) => /** @type {Uint8Array} */ (picture.draw(needle)),
+    shade: (look) => picture.shade(look),
+  };
+}
+
+/** @param {Core} core @param {Pack} pack @returns {Showing} */
+function planeOf(core, { volume, probe, array }) {
+  if (!volume || !probe) throw new Error("A scene in space has a volume and a probe.");
+  const { columns, rows } = probe, apex = probe.shape === "curved" ? [0, -probe.radius] : undefined;
+  const plane = core.plane(core.volume({ shape: volume.shape, spacing: volume.spacing, origin: volume.origin }, /** @type {Uint8Array} */ (array(volume.voxels))), planeOptions(probe));
+  return {
+    columns, rows, follow: () => {}, shade: (look) => plane.shade(look),
+    draw: ({ tissue }, pose, needle) => plane.draw(planeMatrix(pose ?? probe.pose), /** @type {Tissue} */ (tissue), needle && { ...needle, ...(apex ? { apex, curved: 1 } : {}) }),
+  };
+}
+
+/** A recorded pose. @param {Float64Array} poses rows of [entry, tip, speed] @param {number} row @param {number} dt s @param {number} [dimension] @returns {Pose} */
+export function poseOf(poses, row, dt, dimension = 2) {
+  const k = (2 * dimension + 1) * row;
+  return { entry: Array.from(poses.subarray(k, k + dimension)), tip: Array.from(poses.subarray(k + dimension, k + 2 * dimension)), speed: poses[k + 2 * dimension], dt };
 }
 
 /** The needle out of the tissue. @param {Pack} pack @returns {Pose} */
@@ -162,24 +198,20 @@ function home(pack) {
 /** @param {Core} core @param {Pack} pack @param {ModelEntry} model @returns {Solver} */
 function solverOf(core, pack, model) {
   const given = Object.fromEntries(Object.entries(model.arrays).map(([name, array]) => [name, pack.array(array)]));
-  if (model.kind !== "landmarks") return forcedSolver(core, model, given);
+  if (model.kind === "forced") {
+    const tissue = core.green(model.options, /** @type {GreenTables} */ ({ ...model.response, ...given }));
+    return {
+      tissue, reset: () => tissue.reset(), advance: (pose) => tissue.advance(pose), at: (points) => tissue.displacementAt(points), save: () => tissue.save(),
+      load: (saved) => tissue.restore(saved), destroy: () => tissue.destroy(),
+    };
+  }
   const scene = core.scene({ ...model.options, ...given }), tissue = scene.tissue();
   return {
-    reset: () => tissue.reset(),
-    advance: (pose) => tissue.advance(pose),
-    deform: (picture) => picture.follow(tissue),
-    at: (points) => tissue.displacementAt(points),
-    save: () => tissue.save(),
+    tissue, reset: () => tissue.reset(), advance: (pose) => tissue.advance(pose), at: (points) => tissue.displacementAt(points), save: () => tissue.save(),
     load: (saved) => tissue.load(saved),
     destroy: () => {
       tissue.destroy();
       scene.destroy();
     },
   };
-}
-
-/** @param {Core} core @param {ModelEntry} model @param {Record<string, any>} given @returns {Solver} */
-function forcedSolver(core, model, given) {
-  void core, given;
-  throw new Error(`The core of this page does not know how ${model.label} answers forces.`);
 }

@@ -1,5 +1,10 @@
 // The scene that a page shows: a pack of bytes, read and checked. Nothing of it is believed before it has been looked at.
 
+import { PackError, asList, asNumber, asNumbers, asRecord, asText, asWhole, shown } from "./checked.js";
+import { readProbe } from "./probe.js";
+
+/** @import { Probe } from "./probe.js" */
+
 const MAGIC = "ECHOPACK";
 const MOST_PIXELS = 4096 * 4096, MOST_VOXELS = 512 ** 3, MOST_NODES = 1_000_000, MOST_MODELS = 8, MOST_EXERCISES = 100, MOST_VESSELS = 20;
 const LONGEST_MANIFEST = 4 << 20; // bytes
@@ -27,20 +32,11 @@ const ARRAY_TYPES = { uint8: Uint8Array, float32: Float32Array, float64: Float64
  * @typedef {{
  *   dimension: 2 | 3, version: string, title: string, language: string, rate: number, mesh: Lattice, models: ModelEntry[],
  *   image: { columns: number, rows: number, spacing: Point, origin: Point, pixels: string } | null,
- *   volume: (Lattice & { voxels: string }) | null, probe: Record<string, any> | null,
+ *   volume: (Lattice & { voxels: string }) | null, probe: Probe | null,
  *   needle: { entry: number[], direction: number[], lag: number, fastest: number, echo: Record<string, any> },
  *   exercises: Exercise[], array: (name: string) => Values
  * }} Pack
  */
-
-/** Bytes that are no scene; the message is one sentence for a person. */
-export class PackError extends Error {
-  /** @param {string} message */
-  constructor(message) {
-    super(message);
-    this.name = "PackError";
-  }
-}
 
 /** Read a pack. @param {Uint8Array} bytes @returns {Pack} */
 export function readPack(bytes) {
@@ -82,7 +78,7 @@ export function readPack(bytes) {
   return {
     dimension, version: asText(given.version ?? "", "version", 80), title: asText(given.title ?? "", "title", 200),
     language: asText(given.language ?? "en", "language", 20), rate, mesh, models, image, volume,
-    probe: space ? asRecord(given.probe, "probe") : null, needle: readNeedle(asRecord(given.needle, "needle"), dimension), exercises, array,
+    probe: space ? readProbe(given.probe) : null, needle: readNeedle(asRecord(given.needle, "needle"), dimension), exercises, array,
   };
 }
 
@@ -182,48 +178,4 @@ function sized(values, type, count, what) {
   if (!(values instanceof type) || values.length !== count) {
     throw new PackError(`The scene says ${count} bytes for ${what}; its array holds ${values.length} of ${values.constructor.name}. Make the page anew.`);
   }
-}
-
-/** @param {unknown} value @param {string} what @returns {Record<string, any>} */
-export function asRecord(value, what) {
-  if (typeof value !== "object" || value === null || Array.isArray(value)) throw new PackError(`Expected a table for ${what}; got ${shown(value)}.`);
-  return value;
-}
-
-/** @param {unknown} value @param {string} what @param {number} least @param {number} most @returns {any[]} */
-export function asList(value, what, least, most) {
-  if (!Array.isArray(value) || value.length < least || value.length > most) {
-    throw new PackError(`Expected a list of ${least === most ? least : `${least} to ${most}`} for ${what}; got ${Array.isArray(value) ? `${value.length} entries` : shown(value)}.`);
-  }
-  return value;
-}
-
-/** @param {unknown} value @param {string} what @param {number} low @param {number} high @returns {number} */
-export function asNumber(value, what, low = -1e9, high = 1e9) {
-  if (typeof value !== "number" || !Number.isFinite(value) || value < low || value > high) throw new PackError(`Expected a number from ${low} to ${high} for ${what}; got ${shown(value)}.`);
-  return value;
-}
-
-/** @param {unknown} value @param {string} what @param {number} low @param {number} high @returns {number} */
-export function asWhole(value, what, low, high) {
-  const n = asNumber(value, what, low, high);
-  if (!Number.isInteger(n)) throw new PackError(`Expected a whole number for ${what}; got ${n}.`);
-  return n;
-}
-
-/** @param {unknown} value @param {string} what @param {number} count @returns {number[]} */
-export function asNumbers(value, what, count) {
-  return asList(value, what, count, count).map((n) => asNumber(n, what));
-}
-
-/** @param {unknown} value @param {string} what @param {number} most @returns {string} */
-export function asText(value, what, most) {
-  if (typeof value !== "string" || value.length > most) throw new PackError(`Expected at most ${most} characters for ${what}; got ${shown(value)}.`);
-  return value;
-}
-
-/** A value in a message: short, whatever it is. @param {unknown} value */
-function shown(value) {
-  const said = JSON.stringify(value) ?? String(value);
-  return said.length > 40 ? `${said.slice(0, 40)}...` : said;
 }

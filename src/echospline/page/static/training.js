@@ -1,6 +1,7 @@
 // An attempt: recorded row by row, its events, the session that is kept of it, and the checked reader of sessions.
 
-import { PackError, asList, asNumber, asRecord, asText, asWhole, readExercise } from "./scene.js";
+import { PackError, asList, asNumber, asRecord, asText, asWhole } from "./checked.js";
+import { readExercise } from "./scene.js";
 import { ROW, contactsOf, insideOf, redirectionsOf, rowsOf, scoreOf, watchedAt } from "./scoring.js";
 
 /** @import { Exercise } from "./scene.js" */
