@@ -54,7 +54,7 @@ def class_of(path, pack, rows):
     minute = 0
     for name, since, count, owner in (("Ann", 4, 22, ""), ("Ben", 9, 22, ""), (EVIL, 18, 14, ""), ("Dr. Expert", 0, 3, "")):  # fmt: skip
         for k in range(count):
-            error = 0.6 + 3.5 * 0.8 ** (k * 8 / max(since, 4)) + 0.3 * ((7 * k) % 5) / 5
+            error = 0.5 if not since else 0.6 + 3.5 * 0.8 ** (k * 8 / max(since, 4)) + 0.3 * ((7 * k) % 5) / 5
             passed = k >= since or k % 4 == 3
             stored.add(
                 page_scene.EXERCISE, trace, replace(base, final_error=error, passed=passed, time=9.0 + 20 / (1 + k)),

@@ -143,7 +143,7 @@ export function classSessions(answer, group, trainee) {
 export function classCells(s, say, language) {
   const at = new Date(s.started), ended = s.ended === "finished" ? "" : ` · ${say(s.ended === "reset" ? "ended-reset" : "ended-time")}`;
   return [
-    String(s.id), Number.isNaN(at.getTime()) ? s.started : at.toLocaleString(language, { dateStyle: "short", timeStyle: "short" }), s.trainee || say("nobody"), s.exercise, String(s.attempt),
+    String(s.id), Number.isNaN(at.getTime()) ? s.started : at.toLocaleString(language, { dateStyle: "short", timeStyle: "short" }), s.trainee || say("nobody"), String(s.attempt),
     say(s.passed ? "passed" : "failed") + ended, s.error === null ? "–" : `${printed(s.error)} mm`, `${printed(s.time)} s`,
     s.verified === null ? "–" : s.verified ? say("class-verified") : `${say("class-differs")}: ${s.difference}`,
   ];

@@ -125,7 +125,7 @@ export class ClassView {
       level.addEventListener("click", () => void this.mark(session.id, !session.expert));
       return element("tr", {}, ...classCells(session, say, language).map((text) => element("td", { textContent: text })), element("td", {}, replay, beside, level));
     });
-    return this.table(["number", "started", "trainee", "exercise", "class-attempt", "result", "final_error", "time", "class-check", ""], rows);
+    return this.table(["number", "started", "trainee", "class-attempt", "result", "final_error", "time", "class-check", ""], rows);
   }
 
   /** @param {string[]} heads words, or nothing @param {Node[]} rows */
