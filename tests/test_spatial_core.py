@@ -12,15 +12,15 @@ from echospline.errors import InputError, SolverError
 from echospline.mechanics import NeedleForces, SpatialForceModel
 from echospline.mechanics.landmarks import SIDES
 from echospline.mechanics.space_response import SpaceResponse, block
-from echospline.mechanics.spatial_force_model import law_options
 from echospline.mechanics.spatial_fem_response import SpatialFEMResponse
+from echospline.mechanics.spatial_force_model import law_options
 from echospline.scene import Region, SpatialPose, Sphere, Tissue
 
 LAW = NeedleForces()
 SIZE = (36.0, 32.0, 30.0)
 FACES = {
     "free top": {face: "clamped" for face in SIDES if face != "top"},
-    "sliding top": {**{face: "clamped" for face in SIDES}, "top": "sliding"},
+    "sliding top": {**dict.fromkeys(SIDES, "clamped"), "top": "sliding"},
     "mixed": {"left": "sliding", "right": "free", "bottom": "clamped", "front": "free", "back": "sliding", "top": "free"},
     "clamped top": {"left": "free", "right": "free", "bottom": "sliding", "front": "free", "back": "free", "top": "clamped"},
 }  # fmt: skip

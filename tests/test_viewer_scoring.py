@@ -20,12 +20,12 @@ from hypothesis import strategies as st
 
 from echospline.errors import InputError
 from echospline.live import LiveEngine, Recorder, Trace
-from echospline.scenario import load
-from echospline.scene import Insertion, RegularGrid
 from echospline.page import Disc, Exercise, default_exercises, score
-from echospline.viewer import Sessions, sessions_csv, trace_csv
 from echospline.page.exercise import check_exercises
 from echospline.page.scoring import redirections, smoothness
+from echospline.scenario import load
+from echospline.scene import Insertion, RegularGrid
+from echospline.viewer import Sessions, sessions_csv, trace_csv
 from live_scene import EXERCISE, PAST, scene
 
 PERIOD = 0.01

@@ -472,11 +472,15 @@ def test_any_host_name_needs_the_token():
 
 def closing(line, messages=()):
     """Send what the server will not bear, and return how it closed."""
-    with pytest.raises(ConnectionClosed) as closed:
+
+    def talk():
         for message in messages:
             line.send(message)
         while True:
             line.recv(10)
+
+    with pytest.raises(ConnectionClosed) as closed:
+        talk()
     assert closed.value.rcvd is not None, "closed without a word"
     return closed.value.rcvd
 

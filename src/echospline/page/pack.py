@@ -75,6 +75,7 @@ class ModelPart(Part):
     sentence: dict[Name, Text]
     kind: Literal["landmarks", "forced"]
     options: Values
+    response: Values | None = None
     arrays: dict[Name, Name] = {}
 
 
@@ -305,7 +306,11 @@ def _check(pack: Pack) -> None:
         )
     if abs(sum(c * c for c in n.direction) - 1) > UNIT:
         raise InputError(f"the needle's direction must have length 1; got {n.direction}")
-    for key, value in _numbers({"needle.echo": n.echo} | {model.name: model.options for model in m.models}):
+    for key, value in _numbers(
+        {"needle.echo": n.echo}
+        | {model.name: model.options for model in m.models}
+        | {f"{model.name}.response": model.response or {} for model in m.models}
+    ):
         if not isfinite(value):
             raise InputError(f"{key} of a pack must be a finite number; got {value}")
     check_exercises(m.exercises, pack.mesh)
@@ -324,13 +329,21 @@ def _check_model(pack: Pack, model: ModelPart) -> None:
     for name in model.arrays.values():
         if name not in pack.arrays:
             raise InputError(f"model {model.name!r} of a pack names array {name!r}, which it does not hold")
+    values = model.options if model.kind == "landmarks" else model.response or {}
+    for key, wanted in expected.items():
+        if key == "dimension" and model.kind == "forced":
+            continue
+        came = values.get(key)
+        if (came[:D] if isinstance(came, list) else came) != wanted:
+            raise InputError(
+                f"{key} of model {model.name!r} must be that of the pack's mesh, {wanted}; got {came}"
+            )
+    if model.kind == "forced":
+        _check_forced(pack, model)
+        return
+    if model.response is not None:
+        raise InputError(f"model {model.name!r} of a pack has a response, which landmarks have not")
     if model.kind == "landmarks":
-        for key, wanted in expected.items():
-            came = model.options.get(key)
-            if (came[:D] if isinstance(came, list) else came) != wanted:
-                raise InputError(
-                    f"{key} of model {model.name!r} must be that of the pack's mesh, {wanted}; got {came}"
-                )
         allowed = {"clamped_points", "stiffness"}
         if not set(model.arrays) <= allowed:
             raise InputError(
@@ -344,6 +357,19 @@ def _check_model(pack: Pack, model: ModelPart) -> None:
         _typed(pack, model.arrays["stiffness"], "float64", (prod(mesh.shape),), "the stiffness")
         if not (firm > 0).all():
             raise InputError("every stiffness of a pack must be positive (or infinite)")
+
+
+def _check_forced(pack: Pack, model: ModelPart) -> None:
+    from echospline.scenario import ForcedScene  # noqa: PLC0415 - packs without it are read without the numerics
+
+    given = {role: pack.arrays[name] for role, name in model.arrays.items()}
+    for role, array in given.items():
+        if not np.isfinite(array).all():
+            raise InputError(f"{role} of model {model.name!r} of a pack must be finite")
+    law = {name: value for name, value in model.options.items() if not isinstance(value, list)}
+    if len(law) < len(model.options):
+        raise InputError(f"every option of model {model.name!r} of a pack is one number")
+    ForcedScene(law, model.response or {}, given)
 
 
 def _typed(pack: Pack, name: str, dtype: str, shape: tuple[int, ...], what: str) -> None:

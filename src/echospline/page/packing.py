@@ -14,7 +14,7 @@ from echospline.errors import InputError
 from echospline.page.exercise import default_exercises
 from echospline.page.pack import FORMAT, ImagePart, Manifest, MeshPart, ModelPart, NeedlePart, Pack, table
 from echospline.picture import NeedleEcho
-from echospline.scenario import Scenario, landmark_scene
+from echospline.scenario import Scenario, forced_scene, landmark_scene
 from echospline.scene import RegularGrid, UltrasoundImage
 
 LABELS = {"tps": "TPS", "elastic": "Elastic", "green": "Green"}
@@ -116,23 +116,20 @@ def _models(
 ) -> list[ModelPart]:
     """Pack the models, the scenario's own first; their arrays are added to ``arrays``."""
     parts = []
-    for kind in sorted(("tps", "elastic"), key=lambda kind: kind != scenario.model.kind):
-        scene = landmark_scene(scenario, grid, kind, folder)
-        roles = {"clamped_points": scene.clamped_points, "stiffness": scene.stiffness}
-        named = {}
-        for role, array in roles.items():
-            if array is not None and array.size:
-                named[role] = f"{kind}.{role}"
-                arrays[named[role]] = np.array(array)
-        options = {n: list(v) if isinstance(v, tuple) else v for n, v in scene.options.items()}
-        parts.append(
-            ModelPart(
-                name=kind,
-                label=LABELS[kind],
-                sentence=SENTENCES[kind],
-                kind="landmarks",
-                options=options,
-                arrays=named,
-            )
-        )
+    green = forced_scene(scenario, grid, folder)
+    kinds = ("tps", "elastic") if green is None else ("green", "tps", "elastic")
+    for kind in sorted(kinds, key=lambda kind: kind != scenario.model.kind):
+        if kind == "green":
+            assert green is not None
+            given = dict(green.arrays)
+            more = {"kind": "forced", "options": dict(green.options), "response": dict(green.response)}
+        else:
+            scene = landmark_scene(scenario, grid, kind, folder)
+            roles = {"clamped_points": scene.clamped_points, "stiffness": scene.stiffness}
+            given = {role: array for role, array in roles.items() if array is not None}
+            options = {n: list(v) if isinstance(v, tuple) else v for n, v in scene.options.items()}
+            more = {"kind": "landmarks", "options": options}
+        named = {role: f"{kind}.{role}" for role, array in given.items() if array.size}
+        arrays |= {name: np.array(given[role]) for role, name in named.items()}
+        parts.append(ModelPart(name=kind, label=LABELS[kind], sentence=SENTENCES[kind], arrays=named, **more))
     return parts

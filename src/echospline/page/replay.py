@@ -94,12 +94,17 @@ def tissue_of(pack: Pack, model: ModelPart) -> Tissue:
     InputError, SolverError
         If the core refuses it.
     """
-    from echospline.scenario import CoreScene, landmark_steps  # noqa: PLC0415 - packs are read without the numerics
+    from echospline.scenario import (  # noqa: PLC0415 - packs are read without the numerics
+        CoreScene,
+        ForcedScene,
+        forced_steps,
+        landmark_steps,
+    )
 
-    if model.kind != "landmarks":
-        raise InputError(
-            f"model {model.name!r} of this pack is of kind {model.kind!r}, which cannot be run again here"
-        )
+    if model.kind == "forced":
+        law = {name: float(value) for name, value in model.options.items() if not isinstance(value, list)}
+        given = {role: pack.arrays[name] for role, name in model.arrays.items()}
+        return forced_steps(ForcedScene(law, model.response or {}, given))
     points = pack.array(model, "clamped_points")
     clamped = np.empty((0, pack.dimension)) if points is None else np.ascontiguousarray(points)
     return landmark_steps(CoreScene(model.options, clamped, pack.array(model, "stiffness")))

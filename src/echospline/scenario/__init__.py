@@ -6,7 +6,14 @@ from echospline.menu import on_demand
 
 if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.scenario.body_section import BodySection, bodies_of
-    from echospline.scenario.core_models import CoreScene, landmark_scene, landmark_steps
+    from echospline.scenario.core_models import (
+        CoreScene,
+        ForcedScene,
+        forced_scene,
+        forced_steps,
+        landmark_scene,
+        landmark_steps,
+    )
     from echospline.scenario.models import MODELS, build_model
     from echospline.scenario.run import run
     from echospline.scenario.scale import (
@@ -30,12 +37,15 @@ __all__ = [
     "CoreScene",
     "DiscSection",
     "ExerciseSection",
+    "ForcedScene",
     "Scenario",
     "bodies_of",
     "build_model",
     "check",
     "check_store",
     "describe",
+    "forced_scene",
+    "forced_steps",
     "is_spatial",
     "landmark_scene",
     "landmark_steps",

@@ -5,12 +5,20 @@ from __future__ import annotations
 from pathlib import Path
 
 from echospline.errors import InputError
-from echospline.mechanics import CoreScene, NativeStep, TPSModel
+from echospline.mechanics import (
+    CoreScene,
+    ForcedScene,
+    ForcedStep,
+    GreenModel,
+    NativeStep,
+    NeedleForces,
+    TPSModel,
+)
 from echospline.scenario.models import build_model
 from echospline.scenario.scenario import Scenario
 from echospline.scene import RegularGrid
 
-__all__ = ["CoreScene", "landmark_scene", "landmark_steps"]
+__all__ = ["CoreScene", "ForcedScene", "forced_scene", "forced_steps", "landmark_scene", "landmark_steps"]
 
 LANDMARKS = ("tps", "elastic")
 """Models of landmarks."""
@@ -50,3 +58,39 @@ def landmark_steps(scene: CoreScene) -> NativeStep:
         If the core refuses it.
     """
     return NativeStep(scene)
+
+
+def forced_scene(scenario: Scenario, grid: RegularGrid, folder: Path) -> ForcedScene | None:
+    """Return what the core is given for tissue that answers forces by Green's function; None where the scenario's needle has another law.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Its [tissue], [mesh] and [model].
+    grid : RegularGrid
+        The mesh.
+    folder : Path
+        Start of the scenario's relative paths.
+
+    Raises
+    ------
+    InputError
+        If the parameters are invalid.
+    """
+    if scenario.tissue.material != "linear" or scenario.model.forces.law != "stick-slip":
+        return None
+    model = build_model(scenario, grid, kind="green", folder=folder)
+    assert isinstance(model, GreenModel)
+    assert isinstance(model.law, NeedleForces)
+    return ForcedScene.of(model.response, model.law)
+
+
+def forced_steps(scene: ForcedScene) -> ForcedStep:
+    """Return the native core's steps of a forced scene.
+
+    Raises
+    ------
+    InputError, SolverError
+        If the core refuses it.
+    """
+    return ForcedStep(scene)

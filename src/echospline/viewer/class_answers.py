@@ -13,8 +13,8 @@ from typing import Any
 from echospline.errors import InputError
 from echospline.live import Trace
 from echospline.page.exercise import Exercise
-from echospline.viewer.learning_curve import Criterion, Curve, group_median, learning_curve
 from echospline.page.scoring import Score
+from echospline.viewer.learning_curve import Criterion, Curve, group_median, learning_curve
 from echospline.viewer.sessions import Session
 
 METRICS = {

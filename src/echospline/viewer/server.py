@@ -16,6 +16,7 @@ from starlette.routing import Route, WebSocketRoute
 from echospline.errors import InputError
 from echospline.scene import Floats, NeedlePose
 from echospline.viewer import routes, sockets
+from echospline.viewer.class_routes import Classroom, Instructor, class_routes
 from echospline.viewer.guard import Guard
 from echospline.viewer.idle import close_idle
 from echospline.viewer.room import Room
@@ -23,7 +24,6 @@ from echospline.viewer.served_files import ServedFile, core_file, page_file, pho
 from echospline.viewer.served_scene import Scene, SceneOpener
 from echospline.viewer.sessions import Sessions
 from echospline.viewer.settings import LOOPBACK, Settings
-from echospline.viewer.class_routes import Classroom, Instructor, class_routes
 from echospline.viewer.upload import UploadError, Uploads
 
 

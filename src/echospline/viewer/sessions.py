@@ -17,8 +17,8 @@ from echospline.errors import InputError
 from echospline.live import Trace
 from echospline.page import Verified, beyond
 from echospline.page.exercise import Exercise
-from echospline.viewer.pictures import Pictures
 from echospline.page.scoring import Score
+from echospline.viewer.pictures import Pictures
 from echospline.viewer.session_schema import opened, prepare, written
 
 _COLUMNS = (
