@@ -2,29 +2,30 @@
 
 import { lowered, planeMatrix, raised } from "./probe.js";
 import { axisOf } from "./state.js";
+import { asideOf } from "./view.js";
 
 /** @import { Area, DrawCommand, Live } from "./draw_list.js" */
 /** @import { Exercise, Point } from "./scene.js" */
 /** @import { State } from "./state.js" */
 /** @typedef {{ low: number[], high: number[], area: Area }} Box tissue in mm, and where it is drawn */
 
-const WIDTH = 0.27, WIDEST = 270, LEAST = 120; // share of the stage, CSS pixels
-const TURN = (-32 * Math.PI) / 180, TILT = (24 * Math.PI) / 180; // how the body is looked at: from the front, a little from above and aside
-const OUTSIDE = 30; // mm of needle and probe above the skin
+const SHAPE = 0.78; // height over width
+const LOOK_TURN = (-32 * Math.PI) / 180, LOOK_TILT = (24 * Math.PI) / 180; // how the body is looked at: from the front, a little from above and aside
+const ABOVE = 30; // mm of needle and probe above the skin
 const BODY = { line: "rgba(150, 175, 190, 0.55)", skin: "rgba(214, 160, 130, 0.20)", back: "rgba(10, 15, 19, 0.82)", plane: "rgba(95, 212, 224, 0.26)", edge: "#5fd4e0", probe: "#8fa3b0", needle: "#ffffff", hidden: "#8aa0ad" };
 
 /** Where it is drawn, at the lower right of the stage; a drag there moves the probe. @param {State} state @returns {Area} CSS pixels */
-export function bodyArea({ view: { width, height } }) {
-  const wide = Math.max(LEAST, Math.min(WIDEST, WIDTH * width)), high = 0.78 * wide;
+export function bodyArea({ view }) {
+  const { width, height } = view, wide = asideOf(view), high = SHAPE * wide;
   return { left: width - wide - 10, top: height - high - 10, right: width - 10, bottom: height - 10 };
 }
 
 /** Way from the scene to the drawing. @param {Box} box @returns {(p: ArrayLike<number>) => Point} */
 export function projection({ low, high, area }) {
-  const middle = low.map((from, d) => (from + high[d]) / 2), [c, s, ct, st] = [Math.cos(TURN), Math.sin(TURN), Math.cos(TILT), Math.sin(TILT)];
-  const [w, h, l] = low.map((from, d) => high[d] - from), wide = w * c + l * Math.abs(s), tall = (h + OUTSIDE) * ct + (w * Math.abs(s) + l * c) * st;
+  const middle = low.map((from, d) => (from + high[d]) / 2), [c, s, ct, st] = [Math.cos(LOOK_TURN), Math.sin(LOOK_TURN), Math.cos(LOOK_TILT), Math.sin(LOOK_TILT)];
+  const [w, h, l] = low.map((from, d) => high[d] - from), wide = w * c + l * Math.abs(s), tall = (h + ABOVE) * ct + (w * Math.abs(s) + l * c) * st;
   const scale = Math.min((area.right - area.left - 16) / wide, (area.bottom - area.top - 14) / tall);
-  const [cx, cy] = [(area.left + area.right) / 2, (area.top + area.bottom) / 2 + (OUTSIDE * ct * scale) / 2];
+  const [cx, cy] = [(area.left + area.right) / 2, (area.top + area.bottom) / 2 + (ABOVE * ct * scale) / 2];
   return (p) => {
     const [x, y, z] = [p[0] - middle[0], p[1] - middle[1], p[2] - middle[2]];
     return [cx + scale * (x * c + z * s), cy + scale * (y * ct + (x * s - z * c) * st)];
@@ -44,8 +45,8 @@ export function body(state, live, exercise) {
     ? [face(-half, 0), face(half, 0), face(half, probe.depth), face(-half, probe.depth)]
     : [...arc(probe, probe.radius), ...arc(probe, probe.radius + probe.depth).reverse()].map(([x, y]) => face(x, y));
   const top = probe.shape === "linear" ? half : probe.radius * Math.sin(((probe.opening / 2) * Math.PI) / 180), y0 = probe.shape === "linear" ? 0 : probe.origin[1];
-  const axis = axisOf(needle), { entry, tip } = live, back = Array.from(entry, (value, d) => value - OUTSIDE * axis[d]), inside = Math.hypot(...Array.from(tip, (value, d) => value - entry[d])) > 0.2;
-  const [, , off] = lowered(m, tip), ball = (/** @type {number} */ k, /** @type {string} */ ink, /** @type {number} */ radius) => /** @type {DrawCommand} */ ({ draw: "circle", at: to([live.watched[3 * k], live.watched[3 * k + 1], live.watched[3 * k + 2]]), r: Math.max(2.5, (radius * (to([1, 0, 0])[0] - to([0, 0, 0])[0])) / Math.cos(TURN)), ink, width: 1.25, fill: `${ink}44` });
+  const axis = axisOf(needle), { entry, tip } = live, back = Array.from(entry, (value, d) => value - ABOVE * axis[d]), inside = Math.hypot(...Array.from(tip, (value, d) => value - entry[d])) > 0.2;
+  const [, , off] = lowered(m, tip), ball = (/** @type {number} */ k, /** @type {string} */ ink, /** @type {number} */ radius) => /** @type {DrawCommand} */ ({ draw: "circle", at: to([live.watched[3 * k], live.watched[3 * k + 1], live.watched[3 * k + 2]]), r: Math.max(2.5, (radius * (to([1, 0, 0])[0] - to([0, 0, 0])[0])) / Math.cos(LOOK_TURN)), ink, width: 1.25, fill: `${ink}44` });
   return [
     { draw: "bar", area, from: BODY.back, to: BODY.back, round: 8 },
     { draw: "clip", area },

@@ -35,6 +35,7 @@ export const ANGLES = { least: 8, most: 172 }; // degrees
 const OUT = 0.3; // mm; a needle less deep is out and its entry can move
 const EDGE = 1; // mm that entry and tip keep from the edges
 const MOST_CALIPERS = 4, MOST_NOTES = 12, LONGEST_NOTE = 60;
+const BODY_SHARE = 0.27; // of the stage's width, for the small drawing in space
 const EXPECTED = 25; // mm of needle that a view is made for before it is in
 const LEAST_DEPTH = 10; // mm of the picture that are always seen
 const SPEEDS = [0.25, 0.5, 1, 2, 4]; // of a replay
@@ -46,7 +47,7 @@ export function initialState(pack, kept = {}) {
   const home = { entry: pack.needle.entry, ...anglesOf(pack.needle.direction), depth: 0 };
   return {
     extent, low: mesh.origin, high, probe, held: probe?.pose ?? null, rate: pack.rate, home, exercises: pack.exercises, models: pack.models.map((model) => model.name), needle: home,
-    view: { width: 800, height: 600, zoom: 1, pan: [0, 0], flip: false, depth: extent.y1 - extent.y0 },
+    view: { width: 800, height: 600, zoom: 1, pan: [0, 0], flip: false, depth: extent.y1 - extent.y0, aside: probe ? BODY_SHARE : 0 },
     look: { gain: 0, timeGain: Array(TIME_GAINS).fill(0), dynamicRange: 60, invert: false },
     help: { guide: true, rings: true, readouts: true, body: true }, tool: "needle", calipers: [], drawing: null, cursor: null, notes: [], model: pack.models[0].name,
     frozen: false, chosen: pack.exercises[0]?.name ?? "", examination: false, entryRule: "free", run: null, replay: null, touched: false,

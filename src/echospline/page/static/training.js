@@ -1,5 +1,6 @@
 // An attempt: recorded row by row, its events, the session that is kept of it, and the checked reader of sessions.
 
+import { decoded } from "./bytes.js";
 import { PackError, asList, asNumber, asRecord, asText, asWhole } from "./checked.js";
 import { readExercise } from "./scene.js";
 import { ROW, contactsOf, insideOf, redirectionsOf, rowsOf, scoreOf, watchedAt } from "./scoring.js";
@@ -190,5 +191,5 @@ function toBase64(values) {
 
 /** @param {string} text @returns {Float64Array} */
 function fromBase64(text) {
-  return new Float64Array(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer);
+  return new Float64Array(decoded(text).buffer);
 }

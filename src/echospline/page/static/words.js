@@ -38,7 +38,7 @@ const TABLE = {
   "entry": ["Entry", "Einstich"], "angle": ["Angle", "Winkel"], "depth": ["Depth", "Tiefe"],
   "guide": ["Guide line", "Führungslinie"], "rings": ["Rings", "Ringe"], "readouts": ["Numbers", "Zahlen"],
   "probe": ["Probe", "Sonde"], "probe-x": ["Left, right", "Links, rechts"], "probe-z": ["Front, back", "Vor, zurück"], "probe-turn": ["Turn", "Drehen"], "probe-tilt": ["Tilt", "Kippen"], "probe-rock": ["Rock", "Wippen"],
-  "view-along": ["Along the needle", "Längs der Nadel"], "view-along-title": ["The picture holds the whole needle (X)", "Das Bild enthält die ganze Nadel (X)"], "view-across": ["Across it", "Quer dazu"], "view-across-title": ["The picture cuts the needle at its tip (Z)", "Das Bild schneidet die Nadel an der Spitze (Z)"],
+  "view-along": ["Along", "Längs"], "view-along-title": ["The picture holds the whole needle (X)", "Das Bild enthält die ganze Nadel (X)"], "view-across": ["Across", "Quer"], "view-across-title": ["The picture cuts the needle at its tip (Z)", "Das Bild schneidet die Nadel an der Spitze (Z)"],
   "entry-z": ["Entry, back", "Einstich, tief"], "heading": ["Heading", "Richtung"], "body": ["Drawing", "Skizze"],
   "key-probe": ["slide the probe; with Shift turn and tilt", "Sonde schieben; mit Umschalt drehen und kippen"], "key-rock": ["rock the probe", "Sonde wippen"], "key-views": ["probe along, across the needle", "Sonde längs, quer zur Nadel"], "key-heading": ["needle's heading, drawing", "Richtung der Nadel, Skizze"],
   "hint-3-space": ["The other hand: A D W S slide the probe, X and Z look along and across.", "Die andere Hand: A D W S schieben die Sonde, X und Z sehen längs und quer."],
