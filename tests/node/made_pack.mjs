@@ -9,7 +9,7 @@ export const core = readFileSync(new URL("../../src/echospline/_native/echosplin
 
 export const EXERCISE = {
   name: "between", title: "Between", goal: "Reach it.", target: { centre: [18, 9], radius: 2 }, vessels: [{ centre: [11, 5], radius: 1.5 }],
-  most_redirections: null, time_limit: 2, help: true,
+  most_redirections: null, time_limit: 2, help: true, entry: null, entry_between: null, attempts: null,
 };
 
 /** Manifest of the small scene, without its arrays. */

@@ -15,7 +15,7 @@ import { readPack } from "./scene.js";
  */
 /**
  * What a model gives to the engine.
- * @typedef {{ tissue: Tissue | Forced, reset: () => void, advance: (pose: Pose) => void, at: (points: number[]) => ArrayLike<number>, save: () => Uint8Array, load: (saved: Uint8Array) => void, destroy: () => void }} Solver
+ * @typedef {{ readonly tissue: Tissue | Forced | Moving, reset: () => void, advance: (pose: Pose) => void, at: (points: number[]) => ArrayLike<number>, save: () => Uint8Array, load: (saved: Uint8Array) => void, destroy: () => void }} Solver
  */
 
 /**
@@ -25,7 +25,7 @@ import { readPack } from "./scene.js";
  *   shade: (look: CoreLook) => Uint8ClampedArray
  * }} Showing
  */
-/** @import { GreenTables, Look as CoreLook, Needle } from "./../../_native/echospline.js" */
+/** @import { GreenTables, Look as CoreLook, Moving, Needle, SpatialOptions } from "./../../_native/echospline.js" */
 
 /** dB that the grey levels of a recorded picture are taken to span. */
 export const RECORDED_RANGE = 60;
@@ -168,7 +168,7 @@ function imageOf(core, { image, mesh, array }) {
   const { columns, rows, spacing, origin, pixels } = image;
   const picture = core.picture({ columns, rows, spacing, origin, mesh_shape: mesh.shape, mesh_spacing: mesh.spacing, mesh_origin: mesh.origin }, /** @type {Uint8Array} */ (array(pixels)));
   return {
-    columns, rows, follow: ({ tissue }) => picture.follow(tissue), draw: (_, __, needle) => /** @type {Uint8Array} */ (picture.draw(needle)),
+    columns, rows, follow: ({ tissue }) => picture.follow(/** @type {Tissue | Forced} */ (tissue)), draw: (_, __, needle) => /** @type {Uint8Array} */ (picture.draw(needle)),
     shade: (look) => picture.shade(look),
   };
 }
@@ -180,7 +180,7 @@ function planeOf(core, { volume, probe, array }) {
   const plane = core.plane(core.volume({ shape: volume.shape, spacing: volume.spacing, origin: volume.origin }, /** @type {Uint8Array} */ (array(volume.voxels))), planeOptions(probe));
   return {
     columns, rows, follow: () => {}, shade: (look) => plane.shade(look),
-    draw: ({ tissue }, pose, needle) => plane.draw(planeMatrix(pose ?? probe.pose), /** @type {Tissue} */ (tissue), needle && { ...needle, ...(apex ? { apex, curved: 1 } : {}) }),
+    draw: ({ tissue }, pose, needle) => plane.draw(planeMatrix(pose ?? probe.pose), /** @type {Moving} */ (tissue), needle && { ...needle, ...(apex ? { apex, curved: 1 } : {}) }),
   };
 }
 
@@ -198,6 +198,26 @@ function home(pack) {
 /** @param {Core} core @param {Pack} pack @param {ModelEntry} model @returns {Solver} */
 function solverOf(core, pack, model) {
   const given = Object.fromEntries(Object.entries(model.arrays).map(([name, array]) => [name, pack.array(array)]));
+  if (model.kind === "forced" && pack.dimension === 3) {
+    const tissue = core.spatial(/** @type {SpatialOptions} */ ({ ...model.options, ...model.response, ...given }));
+    let moved = true; // the field is that of the state
+    const now = () => {
+      if (moved) tissue.move();
+      moved = false;
+      return tissue;
+    };
+    const after = (/** @type {() => void} */ change) => {
+      change();
+      moved = true;
+    };
+    return {
+      get tissue() {
+        return now();
+      },
+      reset: () => after(() => tissue.reset()), advance: (pose) => after(() => tissue.advance(pose)), at: (points) => now().displacementAt(points), save: () => tissue.save(),
+      load: (saved) => after(() => tissue.restore(saved)), destroy: () => tissue.destroy(),
+    };
+  }
   if (model.kind === "forced") {
     const tissue = core.green(model.options, /** @type {GreenTables} */ ({ ...model.response, ...given }));
     return {

@@ -69,8 +69,8 @@ async function begin() {
   });
   inputOf("trainee").value = choices.trainee ?? "";
   origin = { version: pack.version, core: "", title: pack.title, pack: "" };
-  const picture = pack.image ?? { columns: 2, rows: 2, spacing: [1, 1], origin: [0, 0] };
-  live = { entry: engine.pose.entry, tip: engine.pose.tip, speed: 0, watched: [], expert: null, picture: { ...picture, spacing: [picture.spacing[0], picture.spacing[1]], origin: [picture.origin[0], picture.origin[1]] } };
+  const { columns, rows, spacing, origin: first } = pack.probe ?? /** @type {NonNullable<typeof pack.image>} */ (pack.image);
+  live = { entry: engine.pose.entry, tip: engine.pose.tip, speed: 0, watched: [], expert: null, picture: { columns, rows, spacing: [spacing[0], spacing[1]], origin: [first[0], first[1]] } };
   renderer = new Renderer(/** @type {HTMLCanvasElement} */ (byId("canvas")), newCanvas);
   panels = new Panels(pack, act, command);
   input = new Input(byId("stage"), () => state, act, command);
@@ -151,11 +151,11 @@ function watchedNow(places) {
 
 /** Places whose motion decides whether a new picture is needed: needle, its surroundings, a coarse lattice, targets. */
 function samples() {
-  const { entry, tip } = engine.pose, { x0, x1, y0, y1 } = state.extent, points = [];
-  for (const part of [0.33, 0.66, 1]) for (const side of [-2, 0, 2]) points.push(entry[0] + part * (tip[0] - entry[0]) + side, Math.max(y0, entry[1] + part * (tip[1] - entry[1])));
-  for (let k = 0; k < 16; ++k) points.push(x0 + ((k % 4) + 0.5) * 0.25 * (x1 - x0), y0 + (Math.floor(k / 4) + 0.5) * 0.25 * (y1 - y0));
-  const inside = points.map((value, k) => (k % 2 ? Math.min(Math.max(value, y0), y1) : Math.min(Math.max(value, x0), x1)));
-  return [...Array.from(entry), ...Array.from(tip), ...Array.from(engine.displacementAt(inside))];
+  const { entry, tip } = engine.pose, { low, high } = state, points = [];
+  const inside = (/** @type {number[]} */ p) => p.map((value, d) => Math.min(Math.max(value, low[d]), high[d]));
+  for (const part of [0.33, 0.66, 1]) for (const side of [-2, 0, 2]) points.push(...inside(low.map((_, d) => entry[d] + part * (tip[d] - entry[d]) + (d === 0 ? side : 0))));
+  for (let k = 0; k < 16; ++k) points.push(...low.map((from, d) => from + (d === 0 ? (k % 4) + 0.5 : d === 1 ? Math.floor(k / 4) + 0.5 : 2) * 0.25 * (high[d] - from)));
+  return [...Array.from(entry), ...Array.from(tip), ...Array.from(engine.displacementAt(points))];
 }
 
 function hasMoved() {
@@ -166,6 +166,7 @@ function hasMoved() {
 
 /** @param {number} now ms */
 function draw(now) {
+  engine.plane = state.held;
   const pictured = !drawnState || engine.stale || drawnState.look !== state.look;
   const exercise = state.run?.exercise ?? state.replay?.exercise ?? state.exercises.find((one) => one.name === state.chosen);
   const { entry, tip, speed } = engine.pose;
@@ -180,7 +181,7 @@ function draw(now) {
   renderer.draw(list);
   reel.over(now, list);
   drawnState = state;
-  Object.assign(byId("stage").dataset, { ready: "true", drawn: String(++counts.drawn), steps: String(counts.steps), depth: Math.hypot(tip[0] - entry[0], tip[1] - entry[1]).toFixed(3), model: state.model });
+  Object.assign(byId("stage").dataset, { ready: "true", drawn: String(++counts.drawn), steps: String(counts.steps), depth: Math.hypot(...state.low.map((_, d) => tip[d] - entry[d])).toFixed(3), plane: state.held?.map((value) => value.toFixed(2)).join(" ") ?? "", model: state.model });
 }
 
 // --- training
@@ -270,7 +271,7 @@ function playOn(dt) {
   if (!film || !state.replay) return;
   if (!state.replay.paused) act({ do: "played", rows: dt * state.rate * state.replay.speed });
   film.seek(Math.floor(state.replay.at));
-  const needle = film.needle(state.needle.angle), shown = state.needle;
+  const needle = film.needle(state.needle), shown = state.needle;
   if (needle.entry[0] !== shown.entry[0] || needle.depth !== shown.depth || needle.angle !== shown.angle) act({ do: "adopt", needle });
 }
 
@@ -303,6 +304,9 @@ const COMMANDS = {
   guide: () => act({ do: "help", name: "guide" }),
   rings: () => act({ do: "help", name: "rings" }),
   readouts: () => act({ do: "help", name: "readouts" }),
+  body: () => act({ do: "help", name: "body" }),
+  along: () => act({ do: "over", name: "along" }),
+  across: () => act({ do: "over", name: "across" }),
   caliper: () => act({ do: "tool", name: "caliper" }),
   note: () => act({ do: "tool", name: "note" }),
   mark: () => (state.tool === "note" ? COMMANDS.write("") : act({ do: "mark" })),

@@ -5,13 +5,13 @@ const TABLE = {
   // picture
   "stage": ["Ultrasound picture with the needle. Arrow keys push, pull and turn it; the question mark shows all keys.", "Ultraschallbild mit der Nadel. Pfeiltasten schieben, ziehen und drehen sie; das Fragezeichen zeigt alle Tasten."],
   "target": ["target", "Ziel"], "vessel": ["vessel", "Gefäß"], "expert": ["expert", "Experte"], "frozen": ["Frozen", "Eingefroren"],
-  "depth-short": ["in", "ein"], "to-target": ["to target", "zum Ziel"], "gain-short": ["G", "G"], "range-short": ["DR", "DR"], "time-gain-short": ["TGC", "TGC"],
+  "depth-short": ["in", "ein"], "to-target": ["to target", "zum Ziel"], "off-plane": ["tip off the picture by", "Spitze neben dem Bild um"], "gain-short": ["G", "G"], "range-short": ["DR", "DR"], "time-gain-short": ["TGC", "TGC"],
   "spoken": ["Needle {depth} mm deep, angle {angle} degrees.", "Nadel {depth} mm tief, Winkel {angle} Grad."],
   "spoken-target": ["Tip {distance} mm from the target.", "Spitze {distance} mm vom Ziel."],
   // hint
   "hint-1": ["Press near the skin: the needle enters there.", "Nahe der Haut drücken: dort sticht die Nadel ein."],
   "hint-2": ["Press in the picture to aim, then drag to push.", "Im Bild drücken, um zu zielen; dann ziehen, um zu schieben."],
-  "hint-3": ["Slow or fast, the tissue moves with it.", "Langsam oder schnell, das Gewebe geht mit."],
+  "hint-3": ["Start: bring the tip into the ring. The tissue moves with it.", "Start: die Spitze in den Ring bringen. Das Gewebe geht mit."],
   "keys-hint": ["Keys: arrows steer, ? shows all", "Tasten: Pfeile steuern, ? zeigt alle"],
   // tools
   "freeze": ["Freeze", "Einfrieren"], "freeze-title": ["Let time stand still (C)", "Die Zeit anhalten (C)"],
@@ -37,6 +37,11 @@ const TABLE = {
   "flat": ["Level", "Zurücksetzen"], "flat-title": ["Gain, time gain and dynamic range back to the start", "Verstärkung, Tiefenausgleich und Dynamik wie zu Beginn"],
   "entry": ["Entry", "Einstich"], "angle": ["Angle", "Winkel"], "depth": ["Depth", "Tiefe"],
   "guide": ["Guide line", "Führungslinie"], "rings": ["Rings", "Ringe"], "readouts": ["Numbers", "Zahlen"],
+  "probe": ["Probe", "Sonde"], "probe-x": ["Left, right", "Links, rechts"], "probe-z": ["Front, back", "Vor, zurück"], "probe-turn": ["Turn", "Drehen"], "probe-tilt": ["Tilt", "Kippen"], "probe-rock": ["Rock", "Wippen"],
+  "view-along": ["Along the needle", "Längs der Nadel"], "view-along-title": ["The picture holds the whole needle (X)", "Das Bild enthält die ganze Nadel (X)"], "view-across": ["Across it", "Quer dazu"], "view-across-title": ["The picture cuts the needle at its tip (Z)", "Das Bild schneidet die Nadel an der Spitze (Z)"],
+  "entry-z": ["Entry, back", "Einstich, tief"], "heading": ["Heading", "Richtung"], "body": ["Drawing", "Skizze"],
+  "key-probe": ["slide the probe; with Shift turn and tilt", "Sonde schieben; mit Umschalt drehen und kippen"], "key-rock": ["rock the probe", "Sonde wippen"], "key-views": ["probe along, across the needle", "Sonde längs, quer zur Nadel"], "key-heading": ["needle's heading, drawing", "Richtung der Nadel, Skizze"],
+  "hint-3-space": ["The other hand: A D W S slide the probe, X and Z look along and across.", "Die andere Hand: A D W S schieben die Sonde, X und Z sehen längs und quer."],
   // messages
   "model-kept": ["The model stays as it is while an attempt is recorded.", "Während ein Versuch läuft, bleibt das Modell."],
   "no-attempts": ["This exercise has {count} attempts, and all of them are made.", "Diese Übung hat {count} Versuche, und alle sind gemacht."],
