@@ -27,7 +27,7 @@ from test_page_pack import stub
 
 NODE = shutil.which("node")
 WASM = page_scene.ROOT / "src" / "echospline" / "_native" / "echospline.wasm"
-MODELS = ["tps", "elastic"]
+MODELS = ["tps", "elastic", "green"]
 
 
 @pytest.fixture(scope="module")

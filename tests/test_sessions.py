@@ -134,7 +134,7 @@ def test_a_migration_that_fails_leaves_the_file_as_it_was(tmp_path, rows):
     old_file(path, 3, rows)
     with sqlite3.connect(path) as database:
         database.execute("UPDATE session SET made = 'no JSON' WHERE id = 3")
-    with pytest.raises(InputError, match="session 3 in .* is damaged"):
+    with pytest.raises(InputError, match=r"session 3 in .* is damaged"):
         Sessions(path)
     with sqlite3.connect(path) as database:
         assert database.execute("PRAGMA user_version").fetchone() == (3,)
@@ -331,7 +331,7 @@ def test_benchmarks_and_deletions_change_all_named_sessions_or_none(tmp_path, ro
             record=Record(ended="reset"),
         )  # fmt: skip
     sessions.mark_expert([1, 3], True)
-    with pytest.raises(InputError, match="no session 9.*nothing was changed"):
+    with pytest.raises(InputError, match=r"no session 9.*nothing was changed"):
         sessions.mark_expert([2, 9], True)
     assert [s.expert for s in sessions.every()] == [True, False, True]
     with pytest.raises(InputError, match="no session 9"):

@@ -20,7 +20,7 @@ const model = pack.models.find((one) => one.name === name);
 const given = Object.fromEntries(Object.entries(model.arrays ?? {}).map(([role, key]) => [role, array(key)]));
 const watched = JSON.parse(process.env.WATCHED);
 const forced = model.kind === "forced";
-const tissue = forced ? core.forced(model.options, core.green(model.response, given)) : core.scene({ ...model.options, ...given }).tissue();
+const tissue = forced ? core.green(model.options, { ...model.response, ...given }) : core.scene({ ...model.options, ...given }).tissue();
 const D = pack.mesh.shape.length, row = 2 * D + 1, file = readFileSync(posesPath);
 const poses = new Float64Array(file.buffer.slice(file.byteOffset, file.byteOffset + file.byteLength));
 const fields = [], places = [];
@@ -28,7 +28,7 @@ for (let k = 0; k < poses.length / row; ++k) {
   const at = row * k;
   tissue.advance({ entry: poses.slice(at, at + D), tip: poses.slice(at + D, at + 2 * D), speed: poses[at + 2 * D], dt: 1 / pack.rate });
   if (k % 10 === 9) fields.push(Float64Array.from(tissue.displacement()));
-  if (!forced) places.push(Float64Array.from(tissue.displacementAt(watched)));
+  places.push(Float64Array.from(tissue.displacementAt(watched)));
 }
 let drawn = new Uint8Array(0);
 if (D === 2) {

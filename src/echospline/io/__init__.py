@@ -4,6 +4,7 @@
 """
 
 from echospline.io.arrays import ArrayInfo, LineCine, list_arrays, open_lines
+from echospline.io.dicom_cine import dicom_cine
 from echospline.io.displacement import (
     DisplacementRecord,
     DisplacementWriter,
@@ -44,6 +45,7 @@ __all__ = [
     "Recording",
     "choose_image",
     "decoding",
+    "dicom_cine",
     "displacement_shapes",
     "head",
     "kind_of",

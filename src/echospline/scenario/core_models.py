@@ -81,8 +81,8 @@ def forced_scene(scenario: Scenario, grid: RegularGrid, folder: Path) -> ForcedS
         return None
     model = build_model(scenario, grid, kind="green", folder=folder)
     assert isinstance(model, GreenModel)
-    assert isinstance(model.law, NeedleForces)
-    return ForcedScene.of(model.response, model.law)
+    assert isinstance(model.forces, NeedleForces)
+    return ForcedScene.of(model.response, model.forces)
 
 
 def forced_steps(scene: ForcedScene) -> ForcedStep:

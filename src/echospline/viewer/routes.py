@@ -17,6 +17,7 @@ from echospline.scene import Floats
 from echospline.viewer import reference
 from echospline.viewer.aside import aside
 from echospline.viewer.class_routes import Classroom
+from echospline.viewer.recordings import as_dicom
 from echospline.viewer.room import UNUSED_PICTURES, Room
 from echospline.viewer.served_scene import Scene
 from echospline.viewer.upload import UploadError
@@ -118,6 +119,18 @@ async def _followed(request: Request, scene: Scene, rows: Floats) -> Floats:
     finally:
         stopped.set()
         work.cancel()
+
+
+async def dicom(request: Request) -> Response:
+    """Answer frames of a page as a DICOM file."""
+    room = room_of(request)
+    with room.uploads.turn(client_of(request)):
+        data = await room.uploads.body(request, room.settings.uploads.size)
+        file = await room.compute(lambda: aside(as_dicom, data, request.query_params.get("rate", "30")))
+    return Response(
+        file, media_type="application/dicom",
+        headers={"Content-Disposition": 'attachment; filename="echospline.dcm"'},
+    )  # fmt: skip
 
 
 def client_of(request: Request) -> str:

@@ -72,6 +72,7 @@ def build_app(
             Route("/api/hello", routes.hello),
             Route("/api/open", routes.open_picture, methods=["POST"]),
             Route("/api/fem", routes.fem, methods=["POST"]),
+            Route("/api/dicom", routes.dicom, methods=["POST"]),
             WebSocketRoute("/poses", sockets.poses),
             WebSocketRoute("/phone", sockets.phone),
             *class_routes(classroom),
