@@ -15,6 +15,14 @@ export function decoded(text) {
   return bytes;
 }
 
+/** @param {Float64Array} values little-endian, as every machine with a browser has it */
+export function inBase64(values) {
+  const bytes = new Uint8Array(values.buffer, values.byteOffset, values.byteLength);
+  let text = "";
+  for (let k = 0; k < bytes.length; k += 0x8000) text += String.fromCharCode(...bytes.subarray(k, k + 0x8000));
+  return btoa(text);
+}
+
 /** SHA-256 by the browser, aside; empty where it has none for pages like this. @param {Uint8Array<ArrayBuffer>} bytes @returns {Promise<string>} */
 export async function digest(bytes) {
   return globalThis.crypto?.subtle ? hexadecimal(new Uint8Array(await crypto.subtle.digest("SHA-256", bytes))) : "";

@@ -1,7 +1,7 @@
 // What an instructor looks at: the answer of the server about a class, checked, and the tables and charts that follow from it. Pure.
 
 import { LINES } from "./chart.js";
-import { PackError, asList, asNumber, asRecord, asText, asWhole } from "./scene.js";
+import { PackError, asList, asNumber, asRecord, asText, asWhole } from "./checked.js";
 import { printed } from "./words.js";
 
 /** @import { Chart, ChartLine } from "./chart.js" */

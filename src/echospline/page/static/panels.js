@@ -39,20 +39,17 @@ function all(selector) {
 
 export class Panels {
   /**
-   * @param {Pack} pack
    * @param {(action: Action) => void} act
    * @param {(command: string) => void} command
    */
-  constructor(pack, act, command) {
-    this.pack = pack;
+  constructor(act, command) {
+    /** @type {Pack} */
+    this.pack = /** @type {any} */ (null);
     this.act = act;
+    this.command = command;
     this.language = "";
     /** @type {State | null} */
     this.shown = null;
-    put(byId("title"), pack.title);
-    this.choices("exercises", "exercise", pack.exercises.map((one) => [one.name, one.title]), (name) => act({ do: "choose", name }));
-    this.choices("models", "model", pack.models.map((one) => [one.name, one.label]), (name) => command(`model:${name}`));
-    byId("training").hidden = pack.exercises.length === 0;
     this.sliders = [0, 0, 0, 0, 0, 0].map((_, k) => {
       const range = /** @type {HTMLInputElement} */ (element("input", { type: "range", min: "-20", max: "20", step: "1", value: "0" }));
       range.addEventListener("input", () => act({ do: "timeGain", k, dB: Number(range.value) }));
@@ -66,11 +63,22 @@ export class Panels {
       ["entry", (x) => ({ do: "enter", x })], ["entry-z", (z) => ({ do: "enter", z })], ["heading", (degrees) => ({ do: "heading", degrees })], ["angle", (degrees) => ({ do: "angle", degrees })], ["depth", (mm) => ({ do: "depth", mm })],
     ];
     for (const k of [0, 2, 3, 4, 5]) ranges.push([`probe-${k}`, (value) => ({ do: "hold", k, value })]);
-    document.body.classList.toggle("space", pack.dimension === 3);
     for (const [id, make] of ranges) inputOf(id).addEventListener("input", () => act(make(Number(inputOf(id).value))));
     inputOf("rule").addEventListener("change", () => act({ do: "entryRule", rule: inputOf("rule").value }));
     for (const box of all("[data-help]")) box.addEventListener("change", () => act({ do: "help", name: box.dataset.help }));
     for (const control of all("[data-do]")) control.addEventListener(control.matches("input") ? "change" : "click", () => command(control.dataset.do ?? ""));
+  }
+
+  /** Offer what a scene has. @param {Pack} pack */
+  load(pack) {
+    this.pack = pack;
+    this.shown = null;
+    this.language = "";
+    document.body.classList.toggle("space", pack.dimension === 3);
+    put(byId("title"), pack.title);
+    this.choices("exercises", "exercise", pack.exercises.map((one) => [one.name, one.title]), (name) => this.act({ do: "choose", name }));
+    this.choices("models", "model", pack.models.map((one) => [one.name, one.label]), (name) => this.command(`model:${name}`));
+    byId("training").hidden = pack.exercises.length === 0;
   }
 
   /** Radio buttons with a title and a sentence. @param {string} id @param {string} name @param {[string, string][]} entries @param {(value: string) => void} chosen */
@@ -105,7 +113,7 @@ export class Panels {
     document.body.dataset.theme = state.theme;
     document.body.classList.toggle("recording", run !== null);
     document.body.classList.toggle("replaying", replay !== null);
-    for (const [name, on] of /** @type {[string, boolean][]} */ ([["freeze", state.frozen], ["flip", state.view.flip], ["invert", look.invert], ["caliper", state.tool === "caliper"], ["note", state.tool === "note"]])) {
+    for (const [name, on] of /** @type {[string, boolean][]} */ ([["freeze", state.frozen], ["flip", state.view.flip], ["invert", look.invert], ["caliper", state.tool === "caliper"], ["note", state.tool === "note"], ["fem", state.comparing]])) {
       document.querySelector(`.tools [data-do="${name}"]`)?.setAttribute("aria-pressed", String(on));
     }
     /** @type {HTMLButtonElement} */ (document.querySelector('.tools [data-do="freeze"]')).disabled = run !== null;

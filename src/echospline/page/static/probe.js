@@ -41,6 +41,19 @@ export function planeMatrix([x, y, z, yaw, pitch, roll]) {
   ];
 }
 
+/** The pose of a plane: the inverse of `planeMatrix`. @param {ArrayLike<number>} m 16 numbers, row by row @returns {ProbePose} */
+export function poseOfMatrix(m) {
+  const degrees = 180 / Math.PI;
+  return [m[3], m[7], m[11], Math.atan2(m[2], m[10]) * degrees, Math.asin(Math.max(-1, Math.min(1, -m[6]))) * degrees, Math.atan2(m[4], m[5]) * degrees];
+}
+
+/** A pose turned about its own axes: yaw, then pitch, then roll, degrees. @param {ProbePose} pose @param {ArrayLike<number>} turn @returns {ProbePose} */
+export function turnedBy(pose, turn) {
+  const a = planeMatrix(pose), b = planeMatrix([0, 0, 0, turn[0], turn[1], turn[2]]);
+  const at = (/** @type {number} */ i, /** @type {number} */ j) => (j === 3 ? a[4 * i + 3] : a[4 * i] * b[j] + a[4 * i + 1] * b[4 + j] + a[4 * i + 2] * b[8 + j]);
+  return poseOfMatrix(Array.from({ length: 16 }, (_, k) => (k < 12 ? at(k >> 2, k & 3) : k === 15 ? 1 : 0)));
+}
+
 /** A point of the scene in the frame of the plane: lateral, depth, and how far off the plane, mm. @param {number[] | null} m null: the scene is the plane @param {ArrayLike<number>} p @returns {[number, number, number]} */
 export function lowered(m, p) {
   if (!m) return [p[0], p[1], 0];

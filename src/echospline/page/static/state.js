@@ -24,7 +24,7 @@ import { viewOf, zoomed } from "./view.js";
  *   extent: Extent, low: number[], high: number[], probe: Probe | null, held: ProbePose | null, rate: number, home: NeedleState, exercises: Exercise[], models: string[],
  *   needle: NeedleState, view: ViewState, look: Look, help: Helps,
  *   tool: "needle" | "caliper" | "note", calipers: Caliper[], drawing: Caliper | null, cursor: Point | null, notes: Note[],
- *   model: string, frozen: boolean, chosen: string, examination: boolean, entryRule: EntryRule, run: Run | null, replay: Replay | null,
+ *   model: string, frozen: boolean, comparing: boolean, chosen: string, examination: boolean, entryRule: EntryRule, run: Run | null, replay: Replay | null,
  *   touched: boolean, language: string, theme: "dark" | "light"
  * }} State
  */
@@ -50,7 +50,7 @@ export function initialState(pack, kept = {}) {
     view: { width: 800, height: 600, zoom: 1, pan: [0, 0], flip: false, depth: extent.y1 - extent.y0, aside: probe ? BODY_SHARE : 0 },
     look: { gain: 0, timeGain: Array(TIME_GAINS).fill(0), dynamicRange: 60, invert: false },
     help: { guide: true, rings: true, readouts: true, body: true }, tool: "needle", calipers: [], drawing: null, cursor: null, notes: [], model: pack.models[0].name,
-    frozen: false, chosen: pack.exercises[0]?.name ?? "", examination: false, entryRule: "free", run: null, replay: null, touched: false,
+    frozen: false, comparing: false, chosen: pack.exercises[0]?.name ?? "", examination: false, entryRule: "free", run: null, replay: null, touched: false,
     language: "en", theme: "dark", ...kept,
   };
 }
@@ -184,7 +184,7 @@ function replayed(state, change) {
 
 /** The needle out, at the entry and angle that were chosen. @param {State} state @returns {State} */
 function drawnOut(state) {
-  return { ...state, needle: { ...state.needle, depth: 0 }, frozen: false };
+  return { ...state, needle: { ...state.needle, depth: 0 }, frozen: false, comparing: false };
 }
 
 /** Move the cursor of marks, from the middle of the picture at first. @param {State} state @param {Point} [at] @param {Point} [by] mm @returns {State} */
@@ -220,6 +220,7 @@ const CHANGES = {
   },
   hold: (s, { k, value }) => (s.held ? held(s, /** @type {ProbePose} */ (s.held.map((old, j) => (j === k ? value : old)))) : s),
   over: (s, { name }) => viewedBy(s, name),
+  "hold-all": (s, { pose }) => (s.held ? held(s, pose) : s),
   adoptProbe: (s, { pose }) => (s.held ? { ...s, held: pose } : s),
   // the view
   resize: (s, { width, height }) => viewed(s, { width: Math.max(1, width), height: Math.max(1, height) }),
@@ -235,7 +236,8 @@ const CHANGES = {
   range: (s, { dB }) => looked(s, { dynamicRange: between(dB, 20, 100) }),
   invert: (s) => looked(s, { invert: !s.look.invert }),
   help: (s, { name }) => ({ ...s, help: { ...s.help, [name]: !s.help[/** @type {"guide"} */ (name)] } }),
-  freeze: (s) => (s.run ? s : { ...s, frozen: !s.frozen }),
+  freeze: (s) => (s.run || s.comparing ? s : { ...s, frozen: !s.frozen }),
+  comparing: (s, { on }) => (s.run || s.replay ? s : { ...s, comparing: on, frozen: on }),
   // marks on the picture
   tool: (s, { name }) => ({ ...s, tool: s.tool === name ? "needle" : name, drawing: null, cursor: null }),
   cursor: (s, { at, by }) => cursorMoved(s, at, by),
@@ -267,7 +269,7 @@ const CHANGES = {
   stepped: (s, { steps }) => (s.run ? { ...s, run: { ...s.run, steps } } : s),
   stop: (s) => ({ ...s, run: null }),
   // replay
-  replay: (s, { replay }) => ({ ...s, frozen: false, run: null, model: replay.model, replay: { at: 0, speed: 1, paused: false, ...replay } }),
+  replay: (s, { replay }) => ({ ...s, frozen: false, comparing: false, run: null, model: replay.model, replay: { at: 0, speed: 1, paused: false, ...replay } }),
   scrub: (s, { at }) => replayed(s, { at: between(at, 0, s.replay?.length ?? 0) }),
   pause: (s) => (s.replay && s.replay.paused && s.replay.at >= s.replay.length ? replayed(s, { at: 0, paused: false }) : replayed(s, { paused: !s.replay?.paused })),
   played: (s, { rows }) => {
@@ -291,7 +293,7 @@ function started(state, lot) {
   const given = exercise.entry ?? (span ? [span[0] + lot * (span[1] - span[0]), low[1], state.home.entry[2]] : rule === "fixed" ? state.home.entry : null);
   const needle = { ...state.needle, depth: 0, entry: given ? given.slice(0, state.needle.entry.length) : state.needle.entry };
   return {
-    ...state, needle, frozen: false, replay: null, touched: true, calipers: [], notes: [], drawing: null, cursor: null, tool: "needle",
+    ...state, needle, frozen: false, comparing: false, replay: null, touched: true, calipers: [], notes: [], drawing: null, cursor: null, tool: "needle",
     run: { exercise, examination: state.examination, entryFixed: given !== null, steps: 0 },
   };
 }

@@ -52,6 +52,16 @@ const TABLE = {
   "clip-none": ["Nothing has moved yet.", "Noch hat sich nichts bewegt."], "clip-refused": ["This browser records no video: {reason}", "Dieser Browser nimmt keinen Film auf: {reason}"],
   "saved": ["Saved {name}.", "{name} gespeichert."], "imported": ["{count} attempts read.", "{count} Versuche gelesen."], "other-scene": ["This attempt was made with another scene.", "Dieser Versuch entstand mit einer anderen Szene."],
   "no-model": ["This scene has no model {name}.", "Diese Szene hat kein Modell {name}."],
+  // server
+  "server-lost": ["The server is lost: this page goes on, and attempts are kept here.", "Der Server ist weg: Diese Seite läuft weiter, Versuche bleiben hier."], "tracker": ["Tracker: {text}", "Tracker: {text}"],
+  "handed": ["Attempt {number} is kept and verified by the server.", "Versuch {number} ist vom Server gespeichert und bestätigt."], "handed-unchecked": ["Attempt {number} is kept by the server.", "Versuch {number} ist vom Server gespeichert."],
+  "handed-differs": ["The server kept attempt {number} and computes it differently: {difference}", "Der Server hat Versuch {number} gespeichert und rechnet ihn anders: {difference}"], "refused": ["The server did not take this attempt: {reason}", "Der Server nahm diesen Versuch nicht an: {reason}"],
+  "open": ["Open", "Öffnen"], "open-title": ["Open another picture", "Ein anderes Bild öffnen"], "open-text": ["An image, cine or DICOM file of yours; the server reads it for this page alone.", "Eine Bild-, Film- oder DICOM-Datei; der Server liest sie nur für diese Seite."],
+  "open-none": ["Choose a file.", "Eine Datei wählen."], "open-works": ["The server reads the file...", "Der Server liest die Datei..."], "spacing": ["Pixel spacing, mm", "Pixelabstand, mm"],
+  "dicom": ["DICOM", "DICOM"], "dicom-title": ["Save the last seconds as DICOM", "Die letzten Sekunden als DICOM speichern"], "fem": ["FEM", "FEM"], "fem-title": ["Compare with finite elements at this pose", "Mit finiten Elementen in dieser Lage vergleichen"],
+  "fem-none": ["Push the needle first.", "Zuerst die Nadel schieben."], "fem-works": ["The server computes finite elements...", "Der Server rechnet finite Elemente..."], "fem-differs": ["Shown: finite elements. {model} differs by {mean} mm on average, {most} mm at most.", "Gezeigt: finite Elemente. {model} weicht im Mittel {mean} mm ab, höchstens {most} mm."],
+  "phone": ["Phone", "Telefon"], "phone-title": ["A phone as the probe", "Ein Telefon als Sonde"], "phone-text": ["Open this address on a phone in the same network and hold its button: the probe turns with it. Phones give their orientation to https alone.", "Diese Adresse auf einem Telefon im selben Netz öffnen und den Knopf halten: Die Sonde dreht sich mit. Telefone geben ihre Lage nur an https."],
+  "phone-there": ["The phone is connected.", "Das Telefon ist verbunden."], "phone-gone": ["The phone is gone.", "Das Telefon ist weg."],
   // summary
   "passed": ["Passed", "Bestanden"], "failed": ["Not passed", "Nicht bestanden"], "again": ["Again", "Noch einmal"], "replay": ["Replay", "Wiedergabe"], "close": ["Close", "Schließen"], "export": ["Export", "Exportieren"], "import": ["Import", "Importieren"],
   "ended-reset": ["Ended by Reset.", "Durch Zurück beendet."], "ended-time": ["Time is up.", "Die Zeit ist um."],
