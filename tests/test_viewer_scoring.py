@@ -24,11 +24,42 @@ from echospline.page import Disc, Exercise, default_exercises, score
 from echospline.page.exercise import check_exercises
 from echospline.page.scoring import redirections, smoothness
 from echospline.scenario import load
-from echospline.scene import Insertion, RegularGrid
+from echospline.scene import Insertion, NeedlePose, RegularGrid
 from echospline.viewer import Sessions, sessions_csv, trace_csv
-from live_scene import EXERCISE, PAST, scene
 
 PERIOD = 0.01
+MESH = RegularGrid((41, 31), (1.0, 1.0))
+EXERCISE = Exercise(
+    name="straight-down",
+    title="Straight down",
+    goal="Push the tip into the ring.",
+    target=Disc(centre=(20.0, 12.0), radius=3.0),
+)
+PAST = Exercise(
+    name="past",
+    title="Past the vessel",
+    target=Disc(centre=(28.0, 18.0), radius=2.0),
+    vessels=[Disc(centre=(20.0, 10.0), radius=2.0)],
+    most_redirections=0,
+)
+
+
+class Still:
+    """Tissue that does not move."""
+
+    grid = MESH
+
+    def rest(self):
+        return None
+
+    def advance(self, state, pose, dt):
+        return pose
+
+    def displacement(self, state):
+        return np.zeros((MESH.size, 2))
+
+    def displacement_at(self, state, points):
+        return np.zeros(np.shape(points))
 
 
 def trace_of(insertion, exercise=EXERCISE, after=0.0, shift=(0.0, 0.0)):
@@ -156,7 +187,7 @@ def test_redirections_need_the_needle_inside():
 
 
 def test_a_recorder_takes_every_step_and_begins_anew_at_a_reset():
-    live = LiveEngine(scene().models, "soft", scene().home, rate=100.0)
+    live = LiveEngine(lambda _: Still(), "still", NeedlePose((20.0, 0.0), (20.0, 0.0)), rate=100.0)
     live.watch(EXERCISE.landmarks)
     recorder = Recorder(live.period, longest=0.5)
     live.observe(recorder)
@@ -242,14 +273,14 @@ def test_wrong_exercises_are_refused_by_name(tmp_path, old, new, match):
 
 def test_two_exercises_of_one_name_are_refused():
     with pytest.raises(InputError, match="names must differ"):
-        check_exercises([EXERCISE, EXERCISE], scene().grid)
+        check_exercises([EXERCISE, EXERCISE], MESH)
 
 
 def test_a_target_outside_the_image_is_refused_and_the_default_ones_fit_any():
     outside = Exercise(name="a", title="A", target=Disc(centre=(99.0, 1.0), radius=1.0))
     with pytest.raises(InputError, match="must lie in the image"):
-        check_exercises([outside], scene().grid)
-    for grid in (RegularGrid((5, 90), (3.0, 1.0), (-10.0, 4.0)), scene().grid):
+        check_exercises([outside], MESH)
+    for grid in (RegularGrid((5, 90), (3.0, 1.0), (-10.0, 4.0)), MESH):
         check_exercises(default_exercises(grid), grid)
 
 

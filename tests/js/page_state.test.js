@@ -30,14 +30,14 @@ test("a needle stays in the picture, whatever is asked", () => {
 });
 
 test("the entry moves only while the needle is out", () => {
-  assert.equal(after(freshState(), { do: "entry", x: 12 }).needle.entry[0], 12);
-  assert.equal(after(freshState(), { do: "push", mm: 5 }, { do: "entry", x: 12 }).needle.entry[0], 8);
-  assert.equal(after(freshState(), { do: "entry", x: 1e9 }).needle.entry[0], freshState().extent.x1 - 1);
+  assert.equal(after(freshState(), { do: "enter", x: 12 }).needle.entry[0], 12);
+  assert.equal(after(freshState(), { do: "push", mm: 5 }, { do: "enter", x: 12 }).needle.entry[0], 8);
+  assert.equal(after(freshState(), { do: "enter", x: 1e9 }).needle.entry[0], freshState().extent.x1 - 1);
 });
 
 test("turning deep inside shortens the needle where the picture ends", () => {
   const deep = after(freshState(), { do: "push", mm: 1e6 }), turned = after(deep, { do: "angle", degrees: 20 });
-  assert.ok(turned.needle.depth <= deepestOf(turned.needle, turned.extent) + 1e-12);
+  assert.ok(turned.needle.depth <= deepestOf(turned.needle, turned) + 1e-12);
 });
 
 test("an attempt begins with the needle out and counts its time", () => {
@@ -52,7 +52,7 @@ test("an attempt begins with the needle out and counts its time", () => {
 });
 
 test("an examination shows no help, and an exercise can take help away", () => {
-  const none = { guide: false, rings: false, readouts: false };
+  const none = { guide: false, rings: false, readouts: false, body: false };
   const examined = after(freshState(), { do: "examination" }, { do: "start", lot: 0 });
   assert.deepEqual(helpsOf(examined), none);
   assert.deepEqual(helpsOf(after(examined, { do: "help", name: "rings" })), none, "and it cannot be asked back");
@@ -63,12 +63,12 @@ test("an examination shows no help, and an exercise can take help away", () => {
 });
 
 test("the entry of an examination is free, fixed or drawn by lot", () => {
-  const asked = (rule, lot) => after(freshState(), { do: "entry", x: 20 }, { do: "examination" }, { do: "entryRule", rule }, { do: "start", lot });
+  const asked = (rule, lot) => after(freshState(), { do: "enter", x: 20 }, { do: "examination" }, { do: "entryRule", rule }, { do: "start", lot });
   assert.equal(asked("free", 0.5).needle.entry[0], 20);
   assert.equal(asked("fixed", 0.5).needle.entry[0], 8);
   const drawn = [0, 0.5, 1].map((lot) => asked("drawn", lot).needle.entry[0]);
   assert.ok(drawn[0] < drawn[1] && drawn[1] < drawn[2]);
-  assert.equal(after(asked("drawn", 0.2), { do: "entry", x: 9 }).needle.entry[0], asked("drawn", 0.2).needle.entry[0], "and stays");
+  assert.equal(after(asked("drawn", 0.2), { do: "enter", x: 9 }).needle.entry[0], asked("drawn", 0.2).needle.entry[0], "and stays");
 });
 
 test("a replay cannot be steered, and stops at its end", () => {

@@ -33,10 +33,16 @@ def page(
     are exported from it as one JSON, which `echospline sessions import` reads and checks.
     """
     scenario, folder = scenario_from(source, changes or {})
-    scenario, image = scenario.opened(folder, eight_bit=True)
-    say([*image.notes, *scenario.label_notes(folder)], "note")
-    say(scenario_room.size_doubts(image.grid))
-    html = page_room.bundle(page_room.packed(scenario, image, folder, language=language, rate=rate))
+    if scenario_room.is_spatial(scenario):
+        opened = scenario_room.open_spatial(scenario, folder)
+        say(opened.notes, "note")
+        pack = page_room.packed_space(opened, language=language, rate=rate)
+    else:
+        scenario, image = scenario.opened(folder, eight_bit=True)
+        say([*image.notes, *scenario.label_notes(folder)], "note")
+        say(scenario_room.size_doubts(image.grid))
+        pack = page_room.packed(scenario, image, folder, language=language, rate=rate)
+    html = page_room.bundle(pack)
     data = html.encode()
     with appearing(out) as part:
         part.write_bytes(data)

@@ -9,6 +9,7 @@ if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.page.exercise import Disc, Exercise, check_exercises, default_exercises
     from echospline.page.pack import Pack
     from echospline.page.packing import packed
+    from echospline.page.packing_space import packed_space
     from echospline.page.replay import Verified, pack_of_page, replay, verify
     from echospline.page.rules import beyond, broken_rules
     from echospline.page.scoring import Score, score
@@ -32,6 +33,7 @@ __all__ = [
     "default_exercises",
     "pack_of_page",
     "packed",
+    "packed_space",
     "parsed_sessions",
     "read_sessions",
     "replay",

@@ -59,6 +59,32 @@ class ImagePart(Part):
     pixels: Name
 
 
+class VolumePart(Part):
+    """The tissue at rest in space, grey, 8-bit; x fastest, then y."""
+
+    shape: list[Annotated[int, Field(ge=2, le=4096)]] = Field(min_length=3, max_length=3)
+    spacing: list[Positive] = Field(min_length=3, max_length=3)
+    origin: list[Finite] = Field(min_length=3, max_length=3)
+    voxels: Name
+
+
+class ProbePart(Part):
+    """The probe of a scene in space: its picture, the thickness of its slice, and where a hand holds it at first."""
+
+    shape: Literal["linear", "curved"]
+    columns: Side
+    rows: Side
+    spacing: list[Positive] = Field(min_length=2, max_length=2)
+    origin: list[Finite] = Field(min_length=2, max_length=2)
+    radius: float = Field(ge=1, le=500)
+    opening: float = Field(ge=1, le=179)
+    depth: float = Field(ge=1, le=500)
+    pose: list[Finite] = Field(min_length=6, max_length=6)
+    elevation: float = Field(ge=0, le=100)
+    elevation_depth: float = Field(ge=0.1, le=1000)
+    element_height: float = Field(ge=0, le=200)
+
+
 class MeshPart(Part):
     """The mesh whose nodes carry the displacement."""
 
@@ -109,7 +135,9 @@ class Manifest(Part):
     version: str = Field(min_length=1, max_length=40)
     title: str = Field(min_length=1, max_length=200)
     language: Literal["en", "de"] = "en"
-    image: ImagePart
+    image: ImagePart | None = None
+    volume: VolumePart | None = None
+    probe: ProbePart | None = None
     mesh: MeshPart
     rate: float = Field(120.0, ge=10, le=1000)
     models: list[ModelPart] = Field(min_length=1, max_length=8)
@@ -286,17 +314,25 @@ def _check(pack: Pack) -> None:
         array = pack.arrays[name]
         if array.dtype.name != part.dtype or list(array.shape) != part.shape:
             raise InputError(f"array {name!r} of a pack has another type or shape than its manifest says")
-    if not len(m.mesh.shape) == len(m.mesh.spacing) == len(m.mesh.origin) == 2:
-        raise InputError("the mesh of a picture has two axes")
+    if not len(m.mesh.shape) == len(m.mesh.spacing) == len(m.mesh.origin) == D:
+        raise InputError(f"shape, spacing and origin of a pack's mesh need {D} numbers each")
+    if (m.image is None) != (D == 3) or (m.volume is None) != (D == 2) or (m.probe is None) != (D == 2):
+        raise InputError("a pack holds an image and a mesh of two axes, or a volume, a probe and a mesh of three")
     if prod(m.mesh.shape) > MOST_NODES:
         raise InputError(f"the mesh of a pack has at most {MOST_NODES} nodes; got {prod(m.mesh.shape)}")
-    _typed(pack, m.image.pixels, "uint8", (m.image.rows, m.image.columns), "the picture")
+    if m.volume is not None:
+        shown = m.volume.voxels
+        _typed(pack, shown, "uint8", tuple(m.volume.shape[::-1]), "the volume")
+    else:
+        assert m.image is not None
+        shown = m.image.pixels
+        _typed(pack, shown, "uint8", (m.image.rows, m.image.columns), "the picture")
     names = [model.name for model in m.models]
     if len(set(names)) < len(names):
         raise InputError(f"two models of a pack have one name: {', '.join(names)}")
     for model in m.models:
         _check_model(pack, model)
-    used = {m.image.pixels, *(name for model in m.models for name in model.arrays.values())}
+    used = {shown, *(name for model in m.models for name in model.arrays.values())}
     if used != set(m.arrays):
         raise InputError(f"arrays of a pack that nothing uses: {', '.join(sorted(set(m.arrays) - used))}")
     n = m.needle
@@ -313,7 +349,10 @@ def _check(pack: Pack) -> None:
     ):
         if not isfinite(value):
             raise InputError(f"{key} of a pack must be a finite number; got {value}")
-    check_exercises(m.exercises, pack.mesh)
+    if D == 2:
+        check_exercises(m.exercises, pack.mesh)
+    elif m.exercises:
+        raise InputError("a pack in space holds no exercises yet")
 
 
 def _numbers(tables: Mapping[str, Values]) -> Iterator[tuple[str, float]]:
@@ -329,6 +368,9 @@ def _check_model(pack: Pack, model: ModelPart) -> None:
     for name in model.arrays.values():
         if name not in pack.arrays:
             raise InputError(f"model {model.name!r} of a pack names array {name!r}, which it does not hold")
+    if model.kind == "forced" and D == 3:
+        _check_spatial(pack, model)
+        return
     values = model.options if model.kind == "landmarks" else model.response or {}
     for key, wanted in expected.items():
         if key == "dimension" and model.kind == "forced":
@@ -370,6 +412,32 @@ def _check_forced(pack: Pack, model: ModelPart) -> None:
     if len(law) < len(model.options):
         raise InputError(f"every option of model {model.name!r} of a pack is one number")
     ForcedScene(law, model.response or {}, given)
+
+
+def _check_spatial(pack: Pack, model: ModelPart) -> None:
+    """Refuse tables of a forced model in space that do not fit each other or the mesh."""
+    mesh, response = pack.manifest.mesh, model.response or {}
+    corners = {
+        "low": mesh.origin,
+        "high": [o + h * (n - 1) for o, h, n in zip(mesh.origin, mesh.spacing, mesh.shape, strict=True)],
+    }
+    for name, wanted in corners.items():
+        came = response.get(name)
+        if not isinstance(came, list) or len(came) != 3 or not np.allclose(came, wanted, atol=1e-6):
+            raise InputError(f"{name} of model {model.name!r} must be that of the mesh, {wanted}; got {came}")
+    given = {role: pack.arrays[name] for role, name in model.arrays.items()}
+    if set(given) != {"sources", "conditions", "condition_faces", "answers"}:
+        raise InputError(
+            f"a forced model in space has sources, conditions, condition_faces and answers; got {', '.join(given)}"
+        )
+    points = len(given["condition_faces"])
+    sizes = {role: array.size for role, array in given.items()}
+    rows, rest = divmod(sizes["answers"], max(3 * points, 1))
+    if sizes["conditions"] != 3 * points or sizes["sources"] % 3 or rest or rows - sizes["sources"] not in (0, 3, 6):
+        raise InputError(f"the tables of model {model.name!r} of a pack do not fit each other: {sizes}")
+    for role, array in given.items():
+        if not np.isfinite(array).all():
+            raise InputError(f"{role} of model {model.name!r} of a pack must be finite")
 
 
 def _typed(pack: Pack, name: str, dtype: str, shape: tuple[int, ...], what: str) -> None:

@@ -2,9 +2,25 @@
 
 /** Bytes of a text element. @param {string} text base64 of raw deflate @returns {Promise<Uint8Array<ArrayBuffer>>} */
 export async function inflated(text) {
-  const packed = Uint8Array.from(atob(text.trim()), (c) => c.charCodeAt(0));
-  const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate-raw"));
+  const stream = new Blob([decoded(text.trim())]).stream().pipeThrough(new DecompressionStream("deflate-raw"));
   return new Uint8Array(await new Response(stream).arrayBuffer());
+}
+
+/** Bytes of base64; a page may carry many millions. @param {string} text @returns {Uint8Array<ArrayBuffer>} */
+export function decoded(text) {
+  const fast = /** @type {any} */ (Uint8Array).fromBase64;
+  if (fast) return fast(text);
+  const plain = atob(text), bytes = new Uint8Array(plain.length);
+  for (let k = 0; k < plain.length; ++k) bytes[k] = plain.charCodeAt(k);
+  return bytes;
+}
+
+/** @param {Float64Array} values little-endian, as every machine with a browser has it */
+export function inBase64(values) {
+  const bytes = new Uint8Array(values.buffer, values.byteOffset, values.byteLength);
+  let text = "";
+  for (let k = 0; k < bytes.length; k += 0x8000) text += String.fromCharCode(...bytes.subarray(k, k + 0x8000));
+  return btoa(text);
 }
 
 /** SHA-256 by the browser, aside; empty where it has none for pages like this. @param {Uint8Array<ArrayBuffer>} bytes @returns {Promise<string>} */

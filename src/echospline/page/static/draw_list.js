@@ -1,6 +1,8 @@
 // What is drawn over (and with) the picture, as a list of plain commands: a pure function of the state and of the tissue now.
 
-import { directionOf, helpsOf, secondsLeft } from "./state.js";
+import { arc, body } from "./body.js";
+import { lowered, turnedDown } from "./probe.js";
+import { axisOf, helpsOf, planeOfState, secondsLeft } from "./state.js";
 import { viewOf } from "./view.js";
 
 /** @import { Exercise, Point } from "./scene.js" */
@@ -31,6 +33,8 @@ const INK = "#e8f1f5", QUIET = "#a9bac5", ACCENT = "#5fd4e0", TARGET = "#ffd166"
 const STAGES = { dark: { back: "#05070a", quiet: "#a9bac5", rule: "#5b6b77", from: "#27323b", to: "#4a5a66" }, light: { back: "#dfe6ea", quiet: "#45545e", rule: "#7b8b96", from: "#8b9aa5", to: "#5b6b77" } };
 const OUTSIDE = 34; // mm of shaft that is drawn above the skin
 const HUB_ROOM = 14; // CSS pixels between its end and the top of the stage
+const SLICE = 2.5; // mm off the plane up to which a needle is drawn as lying in it
+const FAR = 400; // mm that the guide reaches
 const LOW_TIME = 10; // s left at which the countdown is coloured
 const IN_TISSUE = 0.2; // mm of depth at which the tip has a ring
 
@@ -38,22 +42,38 @@ const IN_TISSUE = 0.2; // mm of depth at which the tip has a ring
 export function drawList(state, live, say) {
   const view = viewOf(state.view, state.extent), helps = helpsOf(state), stage = STAGES[state.theme];
   const exercise = state.run?.exercise ?? state.replay?.exercise ?? state.exercises.find((one) => one.name === state.chosen);
+  const plane = planeOfState(state), shown = seenFrom(plane, live, state);
   return [
     { draw: "fill", ink: stage.back },
     picture(view, live),
     ...ruler(view, state, stage),
-    ...probe(view, stage),
+    ...probe(view, state, stage),
     { draw: "clip", area: view.area },
-    ...(helps.rings && exercise ? rings(view, live, exercise, say) : []),
-    ...(helps.guide ? guide(view, live, state) : []),
-    ...(live.expert ? expertNeedle(view, live.expert, say) : []),
+    ...(helps.rings && exercise ? rings(view, shown, exercise, say) : []),
+    ...(helps.guide ? guide(view, shown) : []),
+    ...(live.expert ? expertNeedle(view, plane, live.expert, say) : []),
     ...calipers(view, state),
     ...notes(view, state),
     { draw: "clip", area: null },
-    ...hub(view, live, state),
-    ...readouts(view, state, live, helps.readouts, helps.rings && Boolean(exercise), say),
+    ...hub(view, shown),
+    ...readouts(view, state, live, shown, helps.readouts, helps.rings && Boolean(exercise), say),
     ...settings(view, state, say),
+    ...(helps.body ? body(state, live, helps.rings ? exercise : undefined) : []),
   ];
+}
+
+/**
+ * What lies where in the picture: places by lateral distance, depth and distance off the plane, mm.
+ * @typedef {{ entry: [number, number, number], tip: [number, number, number], axis: [number, number, number], places: [number, number, number][], inside: boolean }} Seen
+ */
+
+/** @param {number[] | null} plane @param {Live} live @param {State} state @returns {Seen} */
+function seenFrom(plane, { entry, tip, watched }, { needle, low }) {
+  const count = Math.floor(watched.length / low.length);
+  return {
+    entry: lowered(plane, entry), tip: lowered(plane, tip), axis: turnedDown(plane, axisOf(needle)), inside: Math.hypot(...Array.from(tip, (value, d) => value - entry[d])) > IN_TISSUE,
+    places: Array.from({ length: count }, (_, k) => lowered(plane, Array.from({ length: low.length }, (_, d) => watched[k * low.length + d]))),
+  };
 }
 
 /** @param {View} view @param {Live} live @returns {DrawCommand} */
@@ -77,8 +97,15 @@ function ruler(view, { extent }, stage) {
   return drawn;
 }
 
-/** The probe's face and the dot at its marked side. @param {View} view @param {typeof STAGES.dark} stage @returns {DrawCommand[]} */
-function probe(view, stage) {
+/** The probe's face and the dot at its marked side. @param {View} view @param {State} state @param {typeof STAGES.dark} stage @returns {DrawCommand[]} */
+function probe(view, { probe: shape }, stage) {
+  if (shape?.shape === "curved") {
+    const face = arc(shape, shape.radius - 1.2).map((p) => view.toScreen(p)), [x, y] = face[view.flip ? face.length - 2 : 1];
+    return [
+      { draw: "clip", area: { ...view.area, top: 0 } }, { draw: "line", points: face, ink: stage.to, width: Math.max(6, 2 * view.scale) }, { draw: "clip", area: null },
+      { draw: "circle", at: [x, y], r: 3.5, ink: ACCENT, width: 0, fill: ACCENT },
+    ];
+  }
   const [ax, y] = view.toScreen([view.extent.x0, view.extent.y0]), [bx] = view.toScreen([view.extent.x1, view.extent.y0]);
   const [left, right] = [Math.min(ax, bx), Math.max(ax, bx)], dot = view.flip ? right - 10 : left + 10;
   if (y < view.area.top - 1) return [];
@@ -88,11 +115,11 @@ function probe(view, stage) {
   ];
 }
 
-/** @param {View} view @param {Live} live @param {Exercise} exercise @param {Say} say @returns {DrawCommand[]} */
-function rings(view, { watched }, exercise, say) {
+/** Target and vessels where the plane cuts them. @param {View} view @param {Seen} seen @param {Exercise} exercise @param {Say} say @returns {DrawCommand[]} */
+function rings(view, { places }, exercise, say) {
   return [exercise.target, ...exercise.vessels].flatMap((ring, k) => {
-    if (2 * k + 1 >= watched.length) return [];
-    const at = view.toScreen([watched[2 * k], watched[2 * k + 1]]), r = ring.radius * view.scale, [x, y] = at;
+    if (k >= places.length || Math.abs(places[k][2]) >= ring.radius) return [];
+    const at = view.toScreen(places[k]), r = Math.sqrt(ring.radius ** 2 - places[k][2] ** 2) * view.scale, [x, y] = at;
     const ink = k ? VESSEL : TARGET;
     /** @type {DrawCommand[]} */
     const drawn = [{ draw: "circle", at, r, ink, width: 2, halo: true, ...(k ? { fill: "rgba(255, 90, 90, 0.14)" } : {}) }];
@@ -101,19 +128,32 @@ function rings(view, { watched }, exercise, say) {
   });
 }
 
-/** Where the needle would go. @param {View} view @param {Live} live @param {State} state @returns {DrawCommand[]} */
-function guide(view, { entry, tip }, { needle }) {
-  const [dx, dy] = directionOf(needle.angle), far = 400;
-  const a = view.toScreen(tip), b = view.toScreen([tip[0] + far * dx, tip[1] + far * dy]);
+/** Where the needle would go, as far as that is near the plane; a cross where it would pass through it. @param {View} view @param {Seen} seen @returns {DrawCommand[]} */
+function guide(view, { tip, axis, inside }) {
+  const [from, to] = nearPlane(tip[2], axis[2]);
   /** @type {DrawCommand[]} */
-  const drawn = [{ draw: "line", points: [a, b], ink: ACCENT, width: 1.5, dash: [7, 7], halo: true }];
-  if (Math.hypot(tip[0] - entry[0], tip[1] - entry[1]) > IN_TISSUE) drawn.push({ draw: "circle", at: a, r: 8, ink: ACCENT, width: 1.5, halo: true });
+  const drawn = [];
+  const at = (/** @type {number} */ mm) => view.toScreen([tip[0] + mm * axis[0], tip[1] + mm * axis[1]]);
+  if (to > from) drawn.push({ draw: "line", points: [at(from), at(to)], ink: ACCENT, width: 1.5, dash: [7, 7], halo: true });
+  const through = axis[2] === 0 ? -1 : -tip[2] / axis[2];
+  if (through > 0 && Math.abs(axis[2]) > 0.05) {
+    const [x, y] = at(through);
+    drawn.push({ draw: "line", points: [[x - 6, y - 6], [x + 6, y + 6]], ink: ACCENT, width: 2, halo: true }, { draw: "line", points: [[x - 6, y + 6], [x + 6, y - 6]], ink: ACCENT, width: 2, halo: true });
+  }
+  if (inside && Math.abs(tip[2]) <= SLICE) drawn.push({ draw: "circle", at: view.toScreen(tip), r: 8, ink: ACCENT, width: 1.5, halo: true });
   return drawn;
 }
 
-/** @param {View} view @param {NonNullable<Live["expert"]>} expert @param {Say} say @returns {DrawCommand[]} */
-function expertNeedle(view, { entry, tip }, say) {
-  const [a, b] = [view.toScreen(entry), view.toScreen(tip)];
+/** From where to where a needle that goes on is within SLICE of the plane, mm from its tip. @param {number} off @param {number} by a mm of needle @returns {[number, number]} */
+function nearPlane(off, by) {
+  if (Math.abs(by) < 1e-9) return Math.abs(off) <= SLICE ? [0, FAR] : [0, 0];
+  const [a, b] = [(-SLICE - off) / by, (SLICE - off) / by];
+  return [Math.max(0, Math.min(a, b)), Math.min(FAR, Math.max(a, b))];
+}
+
+/** @param {View} view @param {number[] | null} plane @param {NonNullable<Live["expert"]>} expert @param {Say} say @returns {DrawCommand[]} */
+function expertNeedle(view, plane, { entry, tip }, say) {
+  const [a, b] = [view.toScreen(lowered(plane, entry)), view.toScreen(lowered(plane, tip))];
   return [
     { draw: "line", points: [a, b], ink: EXPERT, width: 2, halo: true, dash: [3, 4] },
     { draw: "circle", at: b, r: 4, ink: EXPERT, width: 2, halo: true },
@@ -121,10 +161,10 @@ function expertNeedle(view, { entry, tip }, say) {
   ];
 }
 
-/** The needle above the skin: where it comes from, even when it is not in. @param {View} view @param {Live} live @param {State} state @returns {DrawCommand[]} */
-function hub(view, { entry }, { needle }) {
-  const [dx, dy] = directionOf(needle.angle), [x, y] = view.toScreen(entry), side = view.flip ? -1 : 1;
-  if (y < view.area.top - 1) return [];
+/** The needle above the skin: where it comes from, even when it is not in. @param {View} view @param {Seen} seen @returns {DrawCommand[]} */
+function hub(view, { entry, axis: [dx, dy] }) {
+  const [x, y] = view.toScreen(entry), side = view.flip ? -1 : 1;
+  if (y < view.area.top - 1 || y > view.area.bottom || dy <= 0) return [];
   const length = Math.min(OUTSIDE * view.scale, Math.max(16, y - HUB_ROOM) / Math.max(dy, 0.35));
   /** @type {Point} */
   const end = [x - side * dx * length, y - dy * length];
@@ -162,8 +202,8 @@ function notes(view, { notes: kept }) {
   return kept.map(({ at, text }) => ({ draw: "text", at: view.toScreen(at), text, ink: NOTE, size: 14, bold: true }));
 }
 
-/** Numbers at the upper right of the picture. @param {View} view @param {State} state @param {Live} live @param {boolean} shown @param {boolean} toTarget @param {Say} say @returns {DrawCommand[]} */
-function readouts(view, state, live, shown, toTarget, say) {
+/** Numbers at the upper right of the picture. @param {View} view @param {State} state @param {Live} live @param {Seen} seen @param {boolean} shown @param {boolean} toTarget @param {Say} say @returns {DrawCommand[]} */
+function readouts(view, state, live, seen, shown, toTarget, say) {
   const right = view.area.right - 12;
   let y = view.area.top + 18;
   /** @type {DrawCommand[]} */
@@ -179,10 +219,11 @@ function readouts(view, state, live, shown, toTarget, say) {
   }
   if (state.frozen) line(say("frozen"), TARGET, 13, true);
   if (!shown) return drawn;
-  const depth = Math.hypot(live.tip[0] - live.entry[0], live.tip[1] - live.entry[1]);
+  const D = state.low.length, depth = Math.hypot(...state.low.map((_, d) => live.tip[d] - live.entry[d]));
   line(`${say("depth-short")} ${depth.toFixed(1)} mm`, INK, 13);
   line(`${state.needle.angle.toFixed(0)}°  ${(Math.abs(live.speed) < 0.05 ? 0 : live.speed).toFixed(0)} mm/s`, QUIET, 13);
-  if (toTarget && live.watched.length >= 2) line(`${say("to-target")} ${Math.hypot(live.tip[0] - live.watched[0], live.tip[1] - live.watched[1]).toFixed(1)} mm`, TARGET, 13);
+  if (toTarget && live.watched.length >= D) line(`${say("to-target")} ${Math.hypot(...state.low.map((_, d) => live.tip[d] - live.watched[d])).toFixed(1)} mm`, TARGET, 13);
+  if (state.held && seen.inside) line(`${say("off-plane")} ${Math.abs(seen.tip[2]).toFixed(1)} mm`, Math.abs(seen.tip[2]) > SLICE ? VESSEL : QUIET, 13);
   return drawn;
 }
 

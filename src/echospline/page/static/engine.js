@@ -15,17 +15,17 @@ import { readPack } from "./scene.js";
  */
 /**
  * What a model gives to the engine.
- * @typedef {{ tissue: Tissue | Forced, reset: () => void, advance: (pose: Pose) => void, at: (points: number[]) => ArrayLike<number>, save: () => Uint8Array, load: (saved: Uint8Array) => void, destroy: () => void }} Solver
+ * @typedef {{ readonly tissue: Tissue | Forced | Moving, reset: () => void, advance: (pose: Pose) => void, at: (points: number[]) => ArrayLike<number>, save: () => Uint8Array, load: (saved: Uint8Array) => void, destroy: () => void }} Solver
  */
 
 /**
  * What shows the tissue: the deformed image, or the plane under the probe.
  * @typedef {{
- *   columns: number, rows: number, follow: (solver: Solver) => void, draw: (solver: Solver, plane: ProbePose | null, needle: Needle | null) => Uint8Array,
+ *   columns: number, rows: number, follow: (solver: Solver, other: Float32Array | null) => void, draw: (solver: Solver, plane: ProbePose | null, needle: Needle | null) => Uint8Array,
  *   shade: (look: CoreLook) => Uint8ClampedArray
  * }} Showing
  */
-/** @import { GreenTables, Look as CoreLook, Needle } from "./../../_native/echospline.js" */
+/** @import { GreenTables, Look as CoreLook, Moving, Needle, SpatialOptions } from "./../../_native/echospline.js" */
 
 /** dB that the grey levels of a recorded picture are taken to span. */
 export const RECORDED_RANGE = 60;
@@ -56,6 +56,8 @@ export class Engine {
     /** @type {Solver} */
     this.solver = solverOf(core, pack, this.model);
     this.stale = true; // the picture's deformation is older than the tissue's
+    /** Displacement of the mesh's nodes by another model, shown in place of this one's until the tissue moves again. @type {Float32Array | null} */
+    this.other = null;
   }
 
   /** Change the model and keep the pose: the new one begins with a straight insertion to it. @param {string} name */
@@ -66,7 +68,13 @@ export class Engine {
     this.solver.destroy();
     this.solver = next;
     this.model = entry;
+    this.insert();
+  }
+
+  /** Bring tissue at rest to the present pose by a straight insertion. */
+  insert() {
     this.stale = true;
+    this.other = null;
     const { entry: from, tip } = this.pose, way = Array.from(tip, (value, d) => value - from[d]);
     const depth = Math.hypot(...way), steps = Math.ceil(depth / STRAIGHT_STRIDE);
     for (let k = 1; k <= steps; ++k) {
@@ -79,6 +87,7 @@ export class Engine {
   reset(entry = this.pack.needle.entry) {
     this.solver.reset();
     this.pose = { entry: Array.from(entry), tip: Array.from(entry), speed: 0, dt: this.dt };
+    this.other = null;
     this.stale = true;
   }
 
@@ -93,6 +102,37 @@ export class Engine {
     this.stale = true;
   }
 
+  /** The needle appears at a place, as one that a tracker sees again. @param {Hand} hand */
+  appear({ entry, tip }) {
+    this.reset(entry);
+    this.pose = { ...this.pose, tip: Array.from(tip) };
+    this.insert();
+  }
+
+  /** Show another model's displacement of the mesh's nodes; says how far it is from this one's, mm. @param {Float32Array} field @returns {{ mean: number, most: number }} */
+  compare(field) {
+    const { tissue } = this.solver;
+    if (!("displacement" in tissue)) throw new Error("This model has no displacement of a mesh.");
+    const own = tissue.displacement(), D = this.pack.dimension;
+    if (own.length !== field.length) throw new Error(`Expected ${own.length} numbers of displacement; got ${field.length}.`);
+    let sum = 0, most = 0;
+    for (let k = 0; k < own.length; k += D) {
+      let square = 0;
+      for (let d = 0; d < D; ++d) square += (own[k + d] - field[k + d]) ** 2;
+      sum += Math.sqrt(square);
+      most = Math.max(most, Math.sqrt(square));
+    }
+    this.other = field;
+    this.stale = true;
+    return { mean: (sum * D) / own.length, most };
+  }
+
+  /** Show this model's displacement again. */
+  show() {
+    this.other = null;
+    this.stale = true;
+  }
+
   /** One step of 1/rate s towards the hand. @param {Hand} hand @returns {Pose} */
   step(hand) {
     const { lag, fastest } = this.pack.needle;
@@ -103,6 +143,7 @@ export class Engine {
   take(pose) {
     this.solver.advance(pose);
     this.pose = pose;
+    this.other = null;
     this.stale = true;
     return pose;
   }
@@ -145,9 +186,18 @@ export class Engine {
     return points.length ? this.solver.at(points) : [];
   }
 
+  /** Places whose motion decides whether a new picture is needed: the needle, its surroundings, a coarse lattice. @param {{ low: number[], high: number[] }} tissue */
+  samples({ low, high }) {
+    const { entry, tip } = this.pose, points = [];
+    const inside = (/** @type {number[]} */ p) => p.map((value, d) => Math.min(Math.max(value, low[d]), high[d]));
+    for (const part of [0.33, 0.66, 1]) for (const side of [-2, 0, 2]) points.push(...inside(low.map((_, d) => entry[d] + part * (tip[d] - entry[d]) + (d === 0 ? side : 0))));
+    for (let k = 0; k < 16; ++k) points.push(...low.map((from, d) => from + (d === 0 ? (k % 4) + 0.5 : d === 1 ? Math.floor(k / 4) + 0.5 : 2) * 0.25 * (high[d] - from)));
+    return [...Array.from(entry), ...Array.from(tip), ...Array.from(this.displacementAt(points))];
+  }
+
   /** The picture now, grey. @returns {Uint8Array} a view, right until the next call into the core */
   grey() {
-    if (this.stale) this.showing.follow(this.solver);
+    if (this.stale) this.showing.follow(this.solver, this.other);
     this.stale = false;
     const { entry, tip } = this.pose;
     const inside = Math.hypot(...Array.from(tip, (value, d) => value - entry[d])) >= OUT_OF_TISSUE;
@@ -168,7 +218,7 @@ function imageOf(core, { image, mesh, array }) {
   const { columns, rows, spacing, origin, pixels } = image;
   const picture = core.picture({ columns, rows, spacing, origin, mesh_shape: mesh.shape, mesh_spacing: mesh.spacing, mesh_origin: mesh.origin }, /** @type {Uint8Array} */ (array(pixels)));
   return {
-    columns, rows, follow: ({ tissue }) => picture.follow(tissue), draw: (_, __, needle) => /** @type {Uint8Array} */ (picture.draw(needle)),
+    columns, rows, follow: ({ tissue }, other) => (other ? picture.deform(other) : picture.follow(/** @type {Tissue | Forced} */ (tissue))), draw: (_, __, needle) => /** @type {Uint8Array} */ (picture.draw(needle)),
     shade: (look) => picture.shade(look),
   };
 }
@@ -180,7 +230,7 @@ function planeOf(core, { volume, probe, array }) {
   const plane = core.plane(core.volume({ shape: volume.shape, spacing: volume.spacing, origin: volume.origin }, /** @type {Uint8Array} */ (array(volume.voxels))), planeOptions(probe));
   return {
     columns, rows, follow: () => {}, shade: (look) => plane.shade(look),
-    draw: ({ tissue }, pose, needle) => plane.draw(planeMatrix(pose ?? probe.pose), /** @type {Tissue} */ (tissue), needle && { ...needle, ...(apex ? { apex, curved: 1 } : {}) }),
+    draw: ({ tissue }, pose, needle) => plane.draw(planeMatrix(pose ?? probe.pose), /** @type {Moving} */ (tissue), needle && { ...needle, ...(apex ? { apex, curved: 1 } : {}) }),
   };
 }
 
@@ -198,6 +248,26 @@ function home(pack) {
 /** @param {Core} core @param {Pack} pack @param {ModelEntry} model @returns {Solver} */
 function solverOf(core, pack, model) {
   const given = Object.fromEntries(Object.entries(model.arrays).map(([name, array]) => [name, pack.array(array)]));
+  if (model.kind === "forced" && pack.dimension === 3) {
+    const tissue = core.spatial(/** @type {SpatialOptions} */ ({ ...model.options, ...model.response, ...given }));
+    let moved = true; // the field is that of the state
+    const now = () => {
+      if (moved) tissue.move();
+      moved = false;
+      return tissue;
+    };
+    const after = (/** @type {() => void} */ change) => {
+      change();
+      moved = true;
+    };
+    return {
+      get tissue() {
+        return now();
+      },
+      reset: () => after(() => tissue.reset()), advance: (pose) => after(() => tissue.advance(pose)), at: (points) => now().displacementAt(points), save: () => tissue.save(),
+      load: (saved) => after(() => tissue.restore(saved)), destroy: () => tissue.destroy(),
+    };
+  }
   if (model.kind === "forced") {
     const tissue = core.green(model.options, /** @type {GreenTables} */ ({ ...model.response, ...given }));
     return {

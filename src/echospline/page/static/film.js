@@ -1,9 +1,9 @@
 // The film of a kept attempt: its poses run again by the engine, to any row, with states on the way to go back to.
 
 import { poseOf } from "./engine.js";
+import { anglesOf } from "./state.js";
 
 /** @import { Engine } from "./engine.js" */
-/** @import { Point } from "./scene.js" */
 /** @import { NeedleState } from "./state.js" */
 
 const CHECKPOINT = 240; // rows between states to go back to
@@ -15,6 +15,7 @@ export class Film {
     this.poses = poses;
     this.beside = beside;
     this.rate = rate;
+    this.dimension = engine.pack.dimension;
     this.row = 0; // rows that have been taken
     /** @type {Map<number, ReturnType<Engine["save"]>>} */
     this.saved = new Map();
@@ -22,7 +23,7 @@ export class Film {
   }
 
   rewind() {
-    this.engine.reset([this.poses[0], this.poses[1]]);
+    this.engine.reset(Array.from(this.poses.subarray(0, this.dimension)));
     this.row = 0;
   }
 
@@ -37,18 +38,18 @@ export class Film {
     }
     for (; this.row < wanted; ++this.row) {
       if (this.row % CHECKPOINT === 0 && !this.saved.has(this.row)) this.saved.set(this.row, this.engine.save());
-      this.engine.take(poseOf(this.poses, this.row, 1 / this.rate));
+      this.engine.take(poseOf(this.poses, this.row, 1 / this.rate, this.dimension));
     }
   }
 
-  /** Where the needle is now, as the hand would say it. @param {number} angle degrees, for a needle that is out @returns {NeedleState} */
-  needle(angle) {
-    const { entry, tip } = this.engine.pose, [dx, dy] = [tip[0] - entry[0], tip[1] - entry[1]], depth = Math.hypot(dx, dy);
-    return { entry: /** @type {Point} */ ([entry[0], entry[1]]), depth, angle: depth > 0.01 ? (Math.atan2(dy, dx) * 180) / Math.PI : angle };
+  /** Where the needle is now, as the hand would say it. @param {NeedleState} before its angles hold for a needle that is out @returns {NeedleState} */
+  needle({ angle, heading }) {
+    const { entry, tip } = this.engine.pose, way = Array.from(tip, (value, d) => value - entry[d]), depth = Math.hypot(...way);
+    return { entry: Array.from(entry), depth, ...(depth > 0.01 ? anglesOf(way) : { angle, heading }) };
   }
 
   /** The expert's needle at this moment. */
   expert() {
-    return this.beside && poseOf(this.beside, Math.min(this.beside.length / 5 - 1, Math.max(0, this.row - 1)), 1);
+    return this.beside && poseOf(this.beside, Math.min(this.beside.length / (2 * this.dimension + 1) - 1, Math.max(0, this.row - 1)), 1, this.dimension);
   }
 }

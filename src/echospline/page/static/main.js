@@ -1,17 +1,20 @@
 // The page: one loop at the screen's rate. It steps the tissue, draws when something has changed, and carries out what is asked.
 
 import { digest, inflated, sha256 } from "./bytes.js";
-import { Reel, download, fileName, newCanvas, pngOf } from "./capture.js";
+import { Reel, newCanvas } from "./capture.js";
 import { closableDialogs, openDialog, showAttempts, showCurve, showSummary } from "./dialogs.js";
 import { drawList } from "./draw_list.js";
 import { Engine } from "./engine.js";
+import { Files, messageOf } from "./files.js";
 import { Film } from "./film.js";
 import { Input } from "./input.js";
 import { Panels, byId, inputOf, put } from "./panels.js";
 import { Renderer } from "./renderer.js";
-import { initialState, next, tipOf } from "./state.js";
+import { Served } from "./served.js";
+import { Server } from "./server.js";
+import { anglesOf, initialState, next, tipOf } from "./state.js";
 import { Store, keepChoices, keptChoices } from "./store.js";
-import { Attempt, attemptsLeft, attemptsMade, fileOf, landmarksOf, posesOf, readSessions } from "./training.js";
+import { Attempt, attemptsLeft, attemptsMade, landmarksOf, posesOf } from "./training.js";
 import { LANGUAGES, wordsOf } from "./words.js";
 
 /** @import { Live } from "./draw_list.js" */
@@ -21,6 +24,8 @@ import { LANGUAGES, wordsOf } from "./words.js";
 
 const LONGEST_FRAME = 0.1; // s of model time that one frame makes up for; a slower screen loses time rather than falling behind
 const PANELS = 50; // ms between changes of the panels, which cost the browser a layout
+const TRACKED = 1000; // ms that a tracked needle is held after its last word
+const MOST_SINCE = 7200 * 7 + 7; // numbers
 const STILL = 0.002; // mm that tissue moves before it is drawn again
 const NOTICE = 5000; // ms
 
@@ -48,7 +53,16 @@ let summed = null;
 let expert = null;
 /** @type {Film | null} */
 let film = null;
+/** @type {Served | null} */
+let served = null;
+/** @type {Uint8Array<ArrayBuffer>} */
+let coreBytes;
+/** Rows of poses since the last reset, as many as a server takes, for its finite elements. @type {number[]} */
+let since = [];
+/** A needle that is steered from outside, and until when. @type {{ entry: number[], tip: number[], until: number } | null} */
+let tracked = null;
 const store = new Store(), reel = new Reel();
+const files = new Files({ reel, store, renderer: () => renderer, view: () => state.view, notice, listed: sessions, say: (key, values) => say(key, values) });
 let last = 0, due = 0, shownAt = 0, halted = false, noticeTimer = 0, attemptNumber = 0;
 /** @type {State | null} */
 let drawnState = null;
@@ -60,23 +74,45 @@ const counts = { drawn: 0, steps: 0 };
 const say = (/** @type {string} */ key, /** @type {Record<string, string | number>} */ values = {}) => wordsOf(state?.language ?? "en")(key, values);
 
 async function begin() {
-  const [coreBytes, packBytes] = await Promise.all(["core", "scene"].map((id) => inflated(byId(id).textContent ?? "")));
-  engine = await Engine.open(coreBytes, packBytes);
-  const { pack } = engine, choices = keptChoices(), light = matchMedia("(prefers-color-scheme: light)").matches;
-  state = initialState(pack, {
-    language: LANGUAGES.includes(choices.language) ? choices.language : LANGUAGES.includes(pack.language) ? pack.language : "en",
+  const server = Server.find(document), choices = keptChoices(), light = matchMedia("(prefers-color-scheme: light)").matches;
+  const bytes = await Promise.all(server ? [server.bytes("core.wasm"), server.bytes("pack")] : ["core", "scene"].map((id) => inflated(byId(id).textContent ?? "")));
+  coreBytes = bytes[0];
+  inputOf("trainee").value = choices.trainee ?? "";
+  renderer = new Renderer(/** @type {HTMLCanvasElement} */ (byId("canvas")), newCanvas);
+  panels = new Panels(act, command);
+  await showScene(bytes[1], {
+    ...(LANGUAGES.includes(choices.language) ? { language: choices.language } : {}),
     theme: choices.theme === "light" || choices.theme === "dark" ? choices.theme : light ? "light" : "dark",
   });
-  inputOf("trainee").value = choices.trainee ?? "";
-  origin = { version: pack.version, core: "", title: pack.title, pack: "" };
-  const picture = pack.image ?? { columns: 2, rows: 2, spacing: [1, 1], origin: [0, 0] };
-  live = { entry: engine.pose.entry, tip: engine.pose.tip, speed: 0, watched: [], expert: null, picture: { ...picture, spacing: [picture.spacing[0], picture.spacing[1]], origin: [picture.origin[0], picture.origin[1]] } };
-  renderer = new Renderer(/** @type {HTMLCanvasElement} */ (byId("canvas")), newCanvas);
-  panels = new Panels(pack, act, command);
   input = new Input(byId("stage"), () => state, act, command);
   closableDialogs();
   wire();
   new ResizeObserver(fit).observe(byId("stage"));
+  requestAnimationFrame(frame);
+  await store.open();
+  if (!server) return;
+  served = new Served(server, {
+    state: () => state, act, engine: () => engine, reel, store, named: () => named(), poses: () => Float64Array.from(since), load: (pack) => showScene(pack, { language: state.language, theme: state.theme }),
+    track, notice, say, saved: (blob, name) => files.saved(blob, name), replay: (session) => playable(session) && replay(session), expert: (session) => (expert = session),
+  });
+  await served.begin();
+}
+
+/** Show a scene. @param {Uint8Array} packBytes @param {Partial<Pick<State, "language" | "theme">>} kept */
+async function showScene(packBytes, kept) {
+  const made = await Engine.open(coreBytes, packBytes), { pack } = made;
+  engine = made;
+  state = initialState(pack, { language: LANGUAGES.includes(pack.language) ? pack.language : "en", ...kept });
+  attempt = film = expert = null;
+  since = [];
+  tracked = null;
+  halted = false;
+  fault("");
+  reel.frames = [];
+  origin = { version: pack.version, core: "", title: pack.title, pack: "" };
+  const { columns, rows, spacing, origin: first } = pack.probe ?? /** @type {NonNullable<typeof pack.image>} */ (pack.image);
+  live = { entry: engine.pose.entry, tip: engine.pose.tip, speed: 0, watched: [], expert: null, picture: { columns, rows, spacing: [spacing[0], spacing[1]], origin: [first[0], first[1]] } };
+  panels.load(pack);
   fit();
   panels.show(state, attemptNumber);
   named = () => {
@@ -84,11 +120,9 @@ async function begin() {
     return origin;
   };
   setTimeout(async () => {
-    const [core, scene] = await Promise.all([coreBytes, packBytes].map(digest));
-    if (core && scene) origin = { ...origin, core, pack: scene };
+    const [core, scene] = await Promise.all([coreBytes, packBytes].map((bytes) => digest(/** @type {Uint8Array<ArrayBuffer>} */ (bytes))));
+    if (core && scene && engine === made) origin = { ...origin, core, pack: scene };
   }, 500);
-  requestAnimationFrame(frame);
-  await store.open();
 }
 
 /** @param {Action} action */
@@ -128,10 +162,12 @@ function frame(now) {
 /** Make the steps that are due. @param {number} dt s */
 function stepOn(dt) {
   due += dt * state.rate;
-  const hand = { entry: state.needle.entry, tip: tipOf(state.needle) };
+  if (tracked && performance.now() > tracked.until) tracked = null;
+  const hand = tracked ?? { entry: state.needle.entry, tip: tipOf(state.needle) };
   for (; due >= 1; --due) {
     const pose = engine.step(hand);
     ++counts.steps;
+    if (served && since.length < MOST_SINCE) since.push(...Array.from(pose.entry).slice(0, state.low.length), ...Array.from(pose.tip).slice(0, state.low.length), pose.speed);
     if (!attempt || !state.run) continue;
     attempt.add(pose, watchedNow(attempt.places));
     if (attempt.steps >= Math.round(attempt.exercise.time_limit * state.rate)) {
@@ -143,34 +179,39 @@ function stepOn(dt) {
   if (attempt && state.run && Math.floor(attempt.steps / state.rate) !== Math.floor(state.run.steps / state.rate)) act({ do: "stepped", steps: attempt.steps });
 }
 
+/** A needle that another hand steers. @param {{ entry: number[], tip: number[] }} hand @param {boolean} appears it was not seen before */
+function track(hand, appears) {
+  if (state.replay) return;
+  tracked = { ...hand, until: performance.now() + TRACKED };
+  if (appears) {
+    if (state.run) finish("reset");
+    engine.appear(hand);
+    since = [];
+  }
+  const way = hand.tip.map((value, d) => value - hand.entry[d]), depth = Math.hypot(...way);
+  act({ do: "adopt", needle: { ...state.needle, entry: hand.entry, depth, ...(depth > 0.01 ? anglesOf(way) : {}) } });
+}
+
 /** Where places lie in the tissue now. @param {number[]} places flat, mm */
 function watchedNow(places) {
   const moved = engine.displacementAt(places);
   return places.map((value, k) => value + moved[k]);
 }
 
-/** Places whose motion decides whether a new picture is needed: needle, its surroundings, a coarse lattice, targets. */
-function samples() {
-  const { entry, tip } = engine.pose, { x0, x1, y0, y1 } = state.extent, points = [];
-  for (const part of [0.33, 0.66, 1]) for (const side of [-2, 0, 2]) points.push(entry[0] + part * (tip[0] - entry[0]) + side, Math.max(y0, entry[1] + part * (tip[1] - entry[1])));
-  for (let k = 0; k < 16; ++k) points.push(x0 + ((k % 4) + 0.5) * 0.25 * (x1 - x0), y0 + (Math.floor(k / 4) + 0.5) * 0.25 * (y1 - y0));
-  const inside = points.map((value, k) => (k % 2 ? Math.min(Math.max(value, y0), y1) : Math.min(Math.max(value, x0), x1)));
-  return [...Array.from(entry), ...Array.from(tip), ...Array.from(engine.displacementAt(inside))];
-}
-
 function hasMoved() {
   if (!engine.stale) return false;
-  const now = samples();
+  const now = engine.samples(state);
   return now.length !== drawnSamples.length || now.some((value, k) => Math.abs(value - drawnSamples[k]) > STILL);
 }
 
 /** @param {number} now ms */
 function draw(now) {
+  engine.plane = state.held;
   const pictured = !drawnState || engine.stale || drawnState.look !== state.look;
   const exercise = state.run?.exercise ?? state.replay?.exercise ?? state.exercises.find((one) => one.name === state.chosen);
   const { entry, tip, speed } = engine.pose;
   live = { ...live, entry, tip, speed, watched: exercise ? watchedNow(landmarksOf(exercise)) : [], expert: film && state.replay ? film.expert() : null };
-  if (engine.stale) drawnSamples = samples();
+  if (engine.stale) drawnSamples = engine.samples(state);
   if (pictured) {
     const colours = engine.draw(state.look);
     renderer.picture(new ImageData(colours, engine.columns, engine.rows));
@@ -180,7 +221,7 @@ function draw(now) {
   renderer.draw(list);
   reel.over(now, list);
   drawnState = state;
-  Object.assign(byId("stage").dataset, { ready: "true", drawn: String(++counts.drawn), steps: String(counts.steps), depth: Math.hypot(tip[0] - entry[0], tip[1] - entry[1]).toFixed(3), model: state.model });
+  Object.assign(byId("stage").dataset, { ready: "true", drawn: String(++counts.drawn), steps: String(counts.steps), depth: Math.hypot(...state.low.map((_, d) => tip[d] - entry[d])).toFixed(3), plane: state.held?.map((value) => value.toFixed(2)).join(" ") ?? "", model: state.model });
 }
 
 // --- training
@@ -204,7 +245,10 @@ function finish(how) {
   act({ do: "stop" });
   if (!made || made.steps === 0) return;
   const session = made.session(how, attemptNumber, named());
-  store.add([session]).then(() => notice(store.refused ? say("not-stored", { reason: store.refused }) : say("stored")));
+  store.add([session]).then(() => {
+    notice(store.refused ? say("not-stored", { reason: store.refused }) : say("stored"));
+    void served?.handIn();
+  });
   if (how !== "reset") summarise(session, made.trace);
 }
 
@@ -214,6 +258,7 @@ function renew() {
   fault("");
   film = null;
   due = 0;
+  since = [];
   engine.reset(state.needle.entry);
 }
 
@@ -270,7 +315,7 @@ function playOn(dt) {
   if (!film || !state.replay) return;
   if (!state.replay.paused) act({ do: "played", rows: dt * state.rate * state.replay.speed });
   film.seek(Math.floor(state.replay.at));
-  const needle = film.needle(state.needle.angle), shown = state.needle;
+  const needle = film.needle(state.needle), shown = state.needle;
   if (needle.entry[0] !== shown.entry[0] || needle.depth !== shown.depth || needle.angle !== shown.angle) act({ do: "adopt", needle });
 }
 
@@ -303,6 +348,9 @@ const COMMANDS = {
   guide: () => act({ do: "help", name: "guide" }),
   rings: () => act({ do: "help", name: "rings" }),
   readouts: () => act({ do: "help", name: "readouts" }),
+  body: () => act({ do: "help", name: "body" }),
+  along: () => act({ do: "over", name: "along" }),
+  across: () => act({ do: "over", name: "across" }),
   caliper: () => act({ do: "tool", name: "caliper" }),
   note: () => act({ do: "tool", name: "note" }),
   mark: () => (state.tool === "note" ? COMMANDS.write("") : act({ do: "mark" })),
@@ -317,8 +365,13 @@ const COMMANDS = {
   sessions: () => sessions(),
   language: () => act({ do: "language", name: LANGUAGES[(LANGUAGES.indexOf(state.language) + 1) % LANGUAGES.length] }) ?? kept(),
   theme: () => act({ do: "theme" }) ?? kept(),
-  picture: () => void pngOf(renderer.canvas).then((blob) => saved(blob, fileName("picture", "png"))),
-  clip: () => void clip(),
+  picture: () => void files.picture(),
+  clip: () => void files.clip(),
+  dicom: () => void served?.dicom(),
+  fem: () => void served?.fem(),
+  phone: () => served?.phone(),
+  open: () => void openDialog("open"),
+  class: () => void served?.class.open(),
 };
 
 /** @param {string} name */
@@ -331,40 +384,6 @@ function model(name) {
   } catch (error) {
     notice(messageOf(error));
     drawnState = null;
-  }
-}
-
-async function clip() {
-  if (reel.seconds === 0) return notice(say("clip-none"));
-  notice(say("clip-works", { seconds: reel.seconds.toFixed(0) }));
-  try {
-    const blob = await reel.record(state.view.width, state.view.height);
-    saved(blob, fileName("clip", blob.type.includes("mp4") ? "mp4" : "webm"));
-  } catch (error) {
-    notice(say("clip-refused", { reason: messageOf(error) }));
-  }
-}
-
-/** @param {Blob} blob @param {string} name */
-function saved(blob, name) {
-  download(blob, name);
-  notice(say("saved", { name }));
-}
-
-/** @param {Session[]} list */
-function exportSessions(list) {
-  saved(new Blob([fileOf(list)], { type: "application/json" }), fileName("sessions", "json"));
-}
-
-/** @param {File} file */
-async function importSessions(file) {
-  try {
-    const read = readSessions(await file.text());
-    await store.add(read);
-    sessions();
-    put(byId("attempts-said"), say("imported", { count: read.length }));
-  } catch (error) {
-    put(byId("attempts-said"), messageOf(error));
   }
 }
 
@@ -387,12 +406,12 @@ function wire() {
     start();
   });
   byId("watch").addEventListener("click", () => summed && replay(summed));
-  byId("export-one").addEventListener("click", () => summed && exportSessions([summed]));
-  byId("export-all").addEventListener("click", () => exportSessions(store.sessions));
+  byId("export-one").addEventListener("click", () => summed && files.exported([summed]));
+  byId("export-all").addEventListener("click", () => files.exported(store.sessions));
   byId("import").addEventListener("click", () => inputOf("import-file").click());
   inputOf("import-file").addEventListener("change", () => {
     const file = inputOf("import-file").files?.[0];
-    if (file) void importSessions(file);
+    if (file) void files.imported(file);
     inputOf("import-file").value = "";
   });
   byId("erase").addEventListener("click", () => confirm(say("erase-sure")) && void store.erase().then(sessions));
@@ -428,12 +447,6 @@ function notice(text) {
 function fault(text) {
   put(byId("fault"), text);
   byId("fault").hidden = !text;
-}
-
-/** @param {unknown} error */
-function messageOf(error) {
-  const text = error instanceof Error ? error.message : String(error);
-  return /[.!?]$/.test(text) ? text : `${text}.`;
 }
 
 begin().catch((error) => fault(messageOf(error)));

@@ -1,5 +1,6 @@
 // The page's controls: what they show follows the state, what a person does with them becomes actions.
 
+import { MOST_TILT } from "./probe.js";
 import { deepestOf, helpsOf, isOut, steerable } from "./state.js";
 import { printed, wordsOf } from "./words.js";
 
@@ -38,20 +39,17 @@ function all(selector) {
 
 export class Panels {
   /**
-   * @param {Pack} pack
    * @param {(action: Action) => void} act
    * @param {(command: string) => void} command
    */
-  constructor(pack, act, command) {
-    this.pack = pack;
+  constructor(act, command) {
+    /** @type {Pack} */
+    this.pack = /** @type {any} */ (null);
     this.act = act;
+    this.command = command;
     this.language = "";
     /** @type {State | null} */
     this.shown = null;
-    put(byId("title"), pack.title);
-    this.choices("exercises", "exercise", pack.exercises.map((one) => [one.name, one.title]), (name) => act({ do: "choose", name }));
-    this.choices("models", "model", pack.models.map((one) => [one.name, one.label]), (name) => command(`model:${name}`));
-    byId("training").hidden = pack.exercises.length === 0;
     this.sliders = [0, 0, 0, 0, 0, 0].map((_, k) => {
       const range = /** @type {HTMLInputElement} */ (element("input", { type: "range", min: "-20", max: "20", step: "1", value: "0" }));
       range.addEventListener("input", () => act({ do: "timeGain", k, dB: Number(range.value) }));
@@ -62,12 +60,25 @@ export class Panels {
     /** @type {[string, (value: number) => Action][]} */
     const ranges = [
       ["seen", (mm) => ({ do: "seen", mm })], ["gain", (dB) => ({ do: "gain", dB })], ["range", (dB) => ({ do: "range", dB })],
-      ["entry", (x) => ({ do: "entry", x })], ["angle", (degrees) => ({ do: "angle", degrees })], ["depth", (mm) => ({ do: "depth", mm })],
+      ["entry", (x) => ({ do: "enter", x })], ["entry-z", (z) => ({ do: "enter", z })], ["heading", (degrees) => ({ do: "heading", degrees })], ["angle", (degrees) => ({ do: "angle", degrees })], ["depth", (mm) => ({ do: "depth", mm })],
     ];
+    for (const k of [0, 2, 3, 4, 5]) ranges.push([`probe-${k}`, (value) => ({ do: "hold", k, value })]);
     for (const [id, make] of ranges) inputOf(id).addEventListener("input", () => act(make(Number(inputOf(id).value))));
     inputOf("rule").addEventListener("change", () => act({ do: "entryRule", rule: inputOf("rule").value }));
     for (const box of all("[data-help]")) box.addEventListener("change", () => act({ do: "help", name: box.dataset.help }));
     for (const control of all("[data-do]")) control.addEventListener(control.matches("input") ? "change" : "click", () => command(control.dataset.do ?? ""));
+  }
+
+  /** Offer what a scene has. @param {Pack} pack */
+  load(pack) {
+    this.pack = pack;
+    this.shown = null;
+    this.language = "";
+    document.body.classList.toggle("space", pack.dimension === 3);
+    put(byId("title"), pack.title);
+    this.choices("exercises", "exercise", pack.exercises.map((one) => [one.name, one.title]), (name) => this.act({ do: "choose", name }));
+    this.choices("models", "model", pack.models.map((one) => [one.name, one.label]), (name) => this.command(`model:${name}`));
+    byId("training").hidden = pack.exercises.length === 0;
   }
 
   /** Radio buttons with a title and a sentence. @param {string} id @param {string} name @param {[string, string][]} entries @param {(value: string) => void} chosen */
@@ -102,7 +113,7 @@ export class Panels {
     document.body.dataset.theme = state.theme;
     document.body.classList.toggle("recording", run !== null);
     document.body.classList.toggle("replaying", replay !== null);
-    for (const [name, on] of /** @type {[string, boolean][]} */ ([["freeze", state.frozen], ["flip", state.view.flip], ["invert", look.invert], ["caliper", state.tool === "caliper"], ["note", state.tool === "note"]])) {
+    for (const [name, on] of /** @type {[string, boolean][]} */ ([["freeze", state.frozen], ["flip", state.view.flip], ["invert", look.invert], ["caliper", state.tool === "caliper"], ["note", state.tool === "note"], ["fem", state.comparing]])) {
       document.querySelector(`.tools [data-do="${name}"]`)?.setAttribute("aria-pressed", String(on));
     }
     /** @type {HTMLButtonElement} */ (document.querySelector('.tools [data-do="freeze"]')).disabled = run !== null;
@@ -123,11 +134,12 @@ export class Panels {
     this.range("seen", 10, extent.y1 - extent.y0, state.view.depth, `${state.view.depth.toFixed(0)} mm`);
     this.range("gain", -30, 30, look.gain, `${look.gain > 0 ? "+" : ""}${look.gain} dB`);
     this.range("range", 20, 100, look.dynamicRange, `${look.dynamicRange} dB`);
-    this.range("entry", extent.x0 + 1, extent.x1 - 1, needle.entry[0], `${needle.entry[0].toFixed(1)} mm`);
+    if (state.held) this.space(state, state.held);
+    this.range("entry", state.low[0] + 1, state.high[0] - 1, needle.entry[0], `${needle.entry[0].toFixed(1)} mm`);
     this.range("angle", 8, 172, needle.angle, `${needle.angle.toFixed(1)}°`);
-    this.range("depth", 0, Math.max(deepestOf(needle, extent), needle.depth), needle.depth, `${needle.depth.toFixed(1)} mm`);
-    for (const id of ["angle", "depth"]) inputOf(id).disabled = !steerable(state);
-    inputOf("entry").disabled = !steerable(state) || !isOut(needle) || run?.entryFixed === true;
+    this.range("depth", 0, Math.max(deepestOf(needle, state), needle.depth), needle.depth, `${needle.depth.toFixed(1)} mm`);
+    for (const id of ["angle", "depth", "heading"]) inputOf(id).disabled = !steerable(state);
+    inputOf("entry").disabled = inputOf("entry-z").disabled = !steerable(state) || !isOut(needle) || run?.entryFixed === true;
     this.sliders.forEach(({ range, row }, k) => {
       const mm = Math.round((k / (this.sliders.length - 1)) * (extent.y1 - extent.y0));
       range.value = String(look.timeGain[k]);
@@ -147,6 +159,15 @@ export class Panels {
     }
   }
 
+  /** The second hand's controls. @param {State} state @param {number[]} held */
+  space({ low, high, needle }, held) {
+    const mm = (/** @type {number} */ value) => `${value.toFixed(1)} mm`, degrees = (/** @type {number} */ value) => `${value.toFixed(0)}°`;
+    for (const k of [0, 2]) this.range(`probe-${k}`, low[k], high[k], held[k], mm(held[k]));
+    for (const k of [3, 4, 5]) this.range(`probe-${k}`, k === 3 ? -180 : -MOST_TILT, k === 3 ? 180 : MOST_TILT, held[k], degrees(held[k]));
+    this.range("entry-z", low[2] + 1, high[2] - 1, needle.entry[2], mm(needle.entry[2]));
+    this.range("heading", -180, 180, needle.heading, degrees(needle.heading));
+  }
+
   /** Marks of events on the time line. @param {State} state @param {(step: number) => void} go */
   events(state, go) {
     const say = wordsOf(state.language), length = state.replay?.length ?? 1;
@@ -163,8 +184,8 @@ export class Panels {
   /** What a reader of the screen finds at the picture; it is asked for, never announced. @param {State} state @param {Live} live */
   spoken(state, live) {
     const say = wordsOf(state.language), helps = helpsOf(state);
-    const depth = Math.hypot(live.tip[0] - live.entry[0], live.tip[1] - live.entry[1]);
-    const near = helps.readouts && live.watched.length >= 2 ? ` ${say("spoken-target", { distance: printed(Math.hypot(live.tip[0] - live.watched[0], live.tip[1] - live.watched[1])) })}` : "";
+    const apart = (/** @type {ArrayLike<number>} */ to) => Math.hypot(...state.low.map((_, d) => live.tip[d] - to[d])), depth = apart(live.entry);
+    const near = helps.readouts && live.watched.length >= state.low.length ? ` ${say("spoken-target", { distance: printed(apart(live.watched)) })}` : "";
     put(byId("spoken"), helps.readouts ? `${say("spoken", { depth: depth.toFixed(1), angle: state.needle.angle.toFixed(0) })}${near}` : "");
   }
 

@@ -11,6 +11,7 @@ import { PackError, asNumber, asNumbers, asRecord, asWhole } from "./checked.js"
  * }} Probe
  */
 
+export const MOST_TILT = 45; // degrees
 const LARGEST_PICTURE = 2048 * 2048;
 
 /** @param {unknown} value @returns {Probe} */
@@ -40,6 +41,19 @@ export function planeMatrix([x, y, z, yaw, pitch, roll]) {
   ];
 }
 
+/** The pose of a plane: the inverse of `planeMatrix`. @param {ArrayLike<number>} m 16 numbers, row by row @returns {ProbePose} */
+export function poseOfMatrix(m) {
+  const degrees = 180 / Math.PI;
+  return [m[3], m[7], m[11], Math.atan2(m[2], m[10]) * degrees, Math.asin(Math.max(-1, Math.min(1, -m[6]))) * degrees, Math.atan2(m[4], m[5]) * degrees];
+}
+
+/** A pose turned about its own axes: yaw, then pitch, then roll, degrees. @param {ProbePose} pose @param {ArrayLike<number>} turn @returns {ProbePose} */
+export function turnedBy(pose, turn) {
+  const a = planeMatrix(pose), b = planeMatrix([0, 0, 0, turn[0], turn[1], turn[2]]);
+  const at = (/** @type {number} */ i, /** @type {number} */ j) => (j === 3 ? a[4 * i + 3] : a[4 * i] * b[j] + a[4 * i + 1] * b[4 + j] + a[4 * i + 2] * b[8 + j]);
+  return poseOfMatrix(Array.from({ length: 16 }, (_, k) => (k < 12 ? at(k >> 2, k & 3) : k === 15 ? 1 : 0)));
+}
+
 /** A point of the scene in the frame of the plane: lateral, depth, and how far off the plane, mm. @param {number[] | null} m null: the scene is the plane @param {ArrayLike<number>} p @returns {[number, number, number]} */
 export function lowered(m, p) {
   if (!m) return [p[0], p[1], 0];
@@ -56,6 +70,20 @@ export function turnedDown(m, d) {
 export function raised(m, p) {
   const z = p[2] ?? 0;
   return [m[0] * p[0] + m[1] * p[1] + m[2] * z + m[3], m[4] * p[0] + m[5] * p[1] + m[6] * z + m[7], m[8] * p[0] + m[9] * p[1] + m[10] * z + m[11]];
+}
+
+/** A pose shifted along the probe's face and across it, on the skin. @param {ArrayLike<number>} pose @param {number} along @param {number} across mm @returns {ProbePose} */
+export function shifted(pose, along, across) {
+  const yaw = (pose[3] * Math.PI) / 180, [c, s] = [Math.cos(yaw), Math.sin(yaw)];
+  return [pose[0] + along * c + across * s, pose[1], pose[2] - along * s + across * c, pose[3], pose[4], pose[5]];
+}
+
+/** A pose that a hand can hold: over the tissue, tilted and rocked no further than MOST_TILT. @param {number[]} pose @param {number[]} low @param {number[]} high mm @returns {ProbePose} */
+export function heldBetween([x, y, z, yaw, pitch, roll], low, high) {
+  const within = (/** @type {number} */ value, /** @type {number} */ least, /** @type {number} */ most) => Math.min(Math.max(value, least), most);
+  return [
+    within(x, low[0], high[0]), y, within(z, low[2], high[2]), ((((yaw + 180) % 360) + 360) % 360) - 180, within(pitch, -MOST_TILT, MOST_TILT), within(roll, -MOST_TILT, MOST_TILT),
+  ];
 }
 
 /** Which pixels the beams reach, 0 or 1; null where all are. @param {Probe} probe @returns {Uint8Array | undefined} */

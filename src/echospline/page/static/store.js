@@ -13,6 +13,8 @@ export class Store {
     this.database = null;
     /** @type {Session[]} */
     this.sessions = [];
+    /** Key of each in the database, and its number at a server: 0 not handed in, -1 refused. @type {Map<Session, { key: IDBValidKey | null, number: number }>} */
+    this.kept = new Map();
     this.refused = "";
   }
 
@@ -21,10 +23,12 @@ export class Store {
       const request = indexedDB.open(DATABASE, 1);
       request.onupgradeneeded = () => request.result.createObjectStore(STORE, { autoIncrement: true });
       this.database = await finished(request);
-      const kept = await finished(this.database.transaction(STORE).objectStore(STORE).getAll());
-      this.sessions = kept.flatMap((value) => {
+      const store = this.database.transaction(STORE).objectStore(STORE), [values, keys] = await Promise.all([finished(store.getAll()), finished(store.getAllKeys())]);
+      this.sessions = values.flatMap((value, k) => {
         try {
-          return [readSession(value, "a kept attempt")];
+          const session = readSession(value, "a kept attempt");
+          this.kept.set(session, { key: keys[k], number: Number(value.handed ?? 0) });
+          return [session];
         } catch {
           return []; // of another page or version: it stays in the database and is not shown
         }
@@ -40,14 +44,27 @@ export class Store {
     if (!this.database) return;
     try {
       const store = this.database.transaction(STORE, "readwrite").objectStore(STORE);
-      for (const session of sessions) await finished(store.add(session));
+      for (const session of sessions) this.kept.set(session, { key: await finished(store.add(session)), number: 0 });
     } catch (error) {
       this.refused = error instanceof Error ? error.message : String(error);
     }
   }
 
+  /** Attempts of this page that no server has. */
+  waiting() {
+    return this.sessions.filter((session) => !this.kept.get(session)?.number);
+  }
+
+  /** Keep the number that a server gave. @param {Session} session @param {number} number */
+  async handed(session, number) {
+    const key = this.kept.get(session)?.key ?? null;
+    this.kept.set(session, { key, number });
+    if (this.database && key !== null) await finished(this.database.transaction(STORE, "readwrite").objectStore(STORE).put({ ...session, handed: number }, key));
+  }
+
   async erase() {
     this.sessions = [];
+    this.kept.clear();
     if (this.database) await finished(this.database.transaction(STORE, "readwrite").objectStore(STORE).clear());
   }
 }

@@ -1,5 +1,6 @@
 // An attempt: recorded row by row, its events, the session that is kept of it, and the checked reader of sessions.
 
+import { decoded, inBase64 } from "./bytes.js";
 import { PackError, asList, asNumber, asRecord, asText, asWhole } from "./checked.js";
 import { readExercise } from "./scene.js";
 import { ROW, contactsOf, insideOf, redirectionsOf, rowsOf, scoreOf, watchedAt } from "./scoring.js";
@@ -60,7 +61,7 @@ export class Attempt {
     return {
       format: 1, kind: SHARE, version: origin.version, core: origin.core, scene: { title: origin.title, pack: origin.pack }, model: this.model,
       exercise: this.exercise, examination: this.examination, trainee: this.trainee, attempt, started: this.started.toISOString(), rate: this.rate, ended,
-      steps: this.steps, poses: toBase64(trace.poses), planes: null, events: eventsOf(trace, this.exercise), score: scoreOf(trace, this.exercise),
+      steps: this.steps, poses: inBase64(trace.poses), planes: null, events: eventsOf(trace, this.exercise), score: scoreOf(trace, this.exercise),
     };
   }
 }
@@ -180,15 +181,7 @@ export function fileOf(sessions) {
   return JSON.stringify({ format: 1, kind: SEVERAL, sessions });
 }
 
-/** @param {Float64Array} values little-endian, as every machine with a browser has it */
-function toBase64(values) {
-  const bytes = new Uint8Array(values.buffer, values.byteOffset, values.byteLength);
-  let text = "";
-  for (let k = 0; k < bytes.length; k += 0x8000) text += String.fromCharCode(...bytes.subarray(k, k + 0x8000));
-  return btoa(text);
-}
-
 /** @param {string} text @returns {Float64Array} */
 function fromBase64(text) {
-  return new Float64Array(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer);
+  return new Float64Array(decoded(text).buffer);
 }

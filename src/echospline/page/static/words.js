@@ -5,13 +5,13 @@ const TABLE = {
   // picture
   "stage": ["Ultrasound picture with the needle. Arrow keys push, pull and turn it; the question mark shows all keys.", "Ultraschallbild mit der Nadel. Pfeiltasten schieben, ziehen und drehen sie; das Fragezeichen zeigt alle Tasten."],
   "target": ["target", "Ziel"], "vessel": ["vessel", "Gefäß"], "expert": ["expert", "Experte"], "frozen": ["Frozen", "Eingefroren"],
-  "depth-short": ["in", "ein"], "to-target": ["to target", "zum Ziel"], "gain-short": ["G", "G"], "range-short": ["DR", "DR"], "time-gain-short": ["TGC", "TGC"],
+  "depth-short": ["in", "ein"], "to-target": ["to target", "zum Ziel"], "off-plane": ["tip off the picture by", "Spitze neben dem Bild um"], "gain-short": ["G", "G"], "range-short": ["DR", "DR"], "time-gain-short": ["TGC", "TGC"],
   "spoken": ["Needle {depth} mm deep, angle {angle} degrees.", "Nadel {depth} mm tief, Winkel {angle} Grad."],
   "spoken-target": ["Tip {distance} mm from the target.", "Spitze {distance} mm vom Ziel."],
   // hint
   "hint-1": ["Press near the skin: the needle enters there.", "Nahe der Haut drücken: dort sticht die Nadel ein."],
   "hint-2": ["Press in the picture to aim, then drag to push.", "Im Bild drücken, um zu zielen; dann ziehen, um zu schieben."],
-  "hint-3": ["Slow or fast, the tissue moves with it.", "Langsam oder schnell, das Gewebe geht mit."],
+  "hint-3": ["Start: bring the tip into the ring. The tissue moves with it.", "Start: die Spitze in den Ring bringen. Das Gewebe geht mit."],
   "keys-hint": ["Keys: arrows steer, ? shows all", "Tasten: Pfeile steuern, ? zeigt alle"],
   // tools
   "freeze": ["Freeze", "Einfrieren"], "freeze-title": ["Let time stand still (C)", "Die Zeit anhalten (C)"],
@@ -37,6 +37,11 @@ const TABLE = {
   "flat": ["Level", "Zurücksetzen"], "flat-title": ["Gain, time gain and dynamic range back to the start", "Verstärkung, Tiefenausgleich und Dynamik wie zu Beginn"],
   "entry": ["Entry", "Einstich"], "angle": ["Angle", "Winkel"], "depth": ["Depth", "Tiefe"],
   "guide": ["Guide line", "Führungslinie"], "rings": ["Rings", "Ringe"], "readouts": ["Numbers", "Zahlen"],
+  "probe": ["Probe", "Sonde"], "probe-x": ["Left, right", "Links, rechts"], "probe-z": ["Front, back", "Vor, zurück"], "probe-turn": ["Turn", "Drehen"], "probe-tilt": ["Tilt", "Kippen"], "probe-rock": ["Rock", "Wippen"],
+  "view-along": ["Along", "Längs"], "view-along-title": ["The picture holds the whole needle (X)", "Das Bild enthält die ganze Nadel (X)"], "view-across": ["Across", "Quer"], "view-across-title": ["The picture cuts the needle at its tip (Z)", "Das Bild schneidet die Nadel an der Spitze (Z)"],
+  "entry-z": ["Entry, back", "Einstich, tief"], "heading": ["Heading", "Richtung"], "body": ["Drawing", "Skizze"],
+  "key-probe": ["slide the probe; with Shift turn and tilt", "Sonde schieben; mit Umschalt drehen und kippen"], "key-rock": ["rock the probe", "Sonde wippen"], "key-views": ["probe along, across the needle", "Sonde längs, quer zur Nadel"], "key-heading": ["needle's heading, drawing", "Richtung der Nadel, Skizze"],
+  "hint-3-space": ["The other hand: A D W S slide the probe, X and Z look along and across.", "Die andere Hand: A D W S schieben die Sonde, X und Z sehen längs und quer."],
   // messages
   "model-kept": ["The model stays as it is while an attempt is recorded.", "Während ein Versuch läuft, bleibt das Modell."],
   "no-attempts": ["This exercise has {count} attempts, and all of them are made.", "Diese Übung hat {count} Versuche, und alle sind gemacht."],
@@ -47,6 +52,16 @@ const TABLE = {
   "clip-none": ["Nothing has moved yet.", "Noch hat sich nichts bewegt."], "clip-refused": ["This browser records no video: {reason}", "Dieser Browser nimmt keinen Film auf: {reason}"],
   "saved": ["Saved {name}.", "{name} gespeichert."], "imported": ["{count} attempts read.", "{count} Versuche gelesen."], "other-scene": ["This attempt was made with another scene.", "Dieser Versuch entstand mit einer anderen Szene."],
   "no-model": ["This scene has no model {name}.", "Diese Szene hat kein Modell {name}."],
+  // server
+  "server-lost": ["The server is lost: this page goes on, and attempts are kept here.", "Der Server ist weg: Diese Seite läuft weiter, Versuche bleiben hier."], "tracker": ["Tracker: {text}", "Tracker: {text}"],
+  "handed": ["Attempt {number} is kept and verified by the server.", "Versuch {number} ist vom Server gespeichert und bestätigt."], "handed-unchecked": ["Attempt {number} is kept by the server.", "Versuch {number} ist vom Server gespeichert."],
+  "handed-differs": ["The server kept attempt {number} and computes it differently: {difference}", "Der Server hat Versuch {number} gespeichert und rechnet ihn anders: {difference}"], "refused": ["The server did not take this attempt: {reason}", "Der Server nahm diesen Versuch nicht an: {reason}"],
+  "open": ["Open", "Öffnen"], "open-title": ["Open another picture", "Ein anderes Bild öffnen"], "open-text": ["An image, cine or DICOM file of yours; the server reads it for this page alone.", "Eine Bild-, Film- oder DICOM-Datei; der Server liest sie nur für diese Seite."],
+  "open-none": ["Choose a file.", "Eine Datei wählen."], "open-works": ["The server reads the file...", "Der Server liest die Datei..."], "spacing": ["Pixel spacing, mm", "Pixelabstand, mm"],
+  "dicom": ["DICOM", "DICOM"], "dicom-title": ["Save the last seconds as DICOM", "Die letzten Sekunden als DICOM speichern"], "fem": ["FEM", "FEM"], "fem-title": ["Compare with finite elements at this pose", "Mit finiten Elementen in dieser Lage vergleichen"],
+  "fem-none": ["Push the needle first.", "Zuerst die Nadel schieben."], "fem-works": ["The server computes finite elements...", "Der Server rechnet finite Elemente..."], "fem-differs": ["Shown: finite elements. {model} differs by {mean} mm on average, {most} mm at most.", "Gezeigt: finite Elemente. {model} weicht im Mittel {mean} mm ab, höchstens {most} mm."],
+  "phone": ["Phone", "Telefon"], "phone-title": ["A phone as the probe", "Ein Telefon als Sonde"], "phone-text": ["Open this address on a phone in the same network and hold its button: the probe turns with it. Phones give their orientation to https alone.", "Diese Adresse auf einem Telefon im selben Netz öffnen und den Knopf halten: Die Sonde dreht sich mit. Telefone geben ihre Lage nur an https."],
+  "phone-there": ["The phone is connected.", "Das Telefon ist verbunden."], "phone-gone": ["The phone is gone.", "Das Telefon ist weg."],
   // summary
   "passed": ["Passed", "Bestanden"], "failed": ["Not passed", "Nicht bestanden"], "again": ["Again", "Noch einmal"], "replay": ["Replay", "Wiedergabe"], "close": ["Close", "Schließen"], "export": ["Export", "Exportieren"], "import": ["Import", "Importieren"],
   "ended-reset": ["Ended by Reset.", "Durch Zurück beendet."], "ended-time": ["Time is up.", "Die Zeit ist um."],
