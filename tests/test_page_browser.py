@@ -15,7 +15,7 @@ from PIL import Image
 from playwright.sync_api import expect
 
 import page_scene
-from echospline.page import bundle, read_sessions, verify
+from echospline.page import bundle, packed_space, read_sessions, verify
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 WASM = page_scene.ROOT / "src" / "echospline" / "_native" / "echospline.wasm"
@@ -190,7 +190,7 @@ def test_the_other_language_changes_every_word_and_is_kept(opened):
     german = page.evaluate(words)
     assert all(text for _, text in [*english, *german])
     same = [word for (word, a), (_, b) in zip(english, german, strict=True) if a == b]
-    assert set(same) <= {"training", "start"}
+    assert set(same) <= {"training", "start", "dicom", "fem"}
     assert page.locator("#models .choice span").first.text_content().startswith("Dünne")
     page.reload()
     ready(page)
@@ -271,7 +271,7 @@ def test_buttons_on_the_screen_push_while_they_are_held(opened):
     assert abs(depth(page) - still) < 0.05
 
 
-def test_every_control_is_reached_and_worked_by_the_keyboard(opened):
+def test_every_control_is_reached_and_worked_by_the_keyboard(opened, pack):
     page = ready(opened())
     page.locator("#stage").focus()
     seen, last = [], None
@@ -305,7 +305,7 @@ def test_every_control_is_reached_and_worked_by_the_keyboard(opened):
     assert depth(page) == 0, "a slider's arrows do not push the needle"
     page.locator("#models input").first.focus()
     page.keyboard.press("ArrowDown")
-    until(page, "document.getElementById('stage').dataset.model === 'elastic'")
+    until(page, f"document.getElementById('stage').dataset.model === '{pack.manifest.models[1].name}'")
 
 
 @pytest.mark.parametrize(
@@ -570,3 +570,84 @@ def test_a_damaged_scene_is_said_in_one_sentence(opened, file, tmp_path, harm):
     said = page.locator("#fault").text_content()
     assert said.endswith((".", "!"))
     assert len(said) < 300
+
+
+# --- in space
+
+
+@pytest.fixture(scope="module")
+def volume_file(tmp_path_factory):
+    from test_page_space import opened as volume_scene  # noqa: PLC0415 - it imports what this module offers
+
+    path = tmp_path_factory.mktemp("space") / "volume.html"
+    path.write_text(bundle(packed_space(volume_scene())), encoding="utf-8")
+    return path
+
+
+def plane(page) -> list[float]:
+    """Where the probe is held: x, y, z, yaw, pitch, roll."""
+    return [float(v) for v in page.evaluate("document.getElementById('stage').dataset.plane").split()]
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_a_volume_opens_offline_with_the_probe_in_the_other_hand(opened, volume_file, size):
+    page = ready(opened(size, path=volume_file))
+    assert picture(page).std() > 10
+    assert page.evaluate("document.documentElement.scrollWidth") <= SIZES[size][0]
+    along = picture(page)
+    page.keyboard.press("z")
+    until(page, "document.getElementById('stage').dataset.plane.split(' ')[3] === '90.00'")
+    page.wait_for_timeout(150)
+    assert np.abs(picture(page) - along).mean() > 2
+    page.keyboard.press("x")
+    until(page, "document.getElementById('stage').dataset.plane.split(' ')[3] === '0.00'")
+
+
+def test_both_hands_work_at_once(opened, volume_file):
+    page = ready(opened(path=volume_file))
+    before = plane(page)
+    page.keyboard.down("ArrowDown")
+    page.keyboard.down("KeyD")
+    until(page, "Number(document.getElementById('stage').dataset.depth) > 4")
+    page.keyboard.up("KeyD")
+    page.keyboard.up("ArrowDown")
+    after = plane(page)
+    assert after[0] > before[0] + 2
+    page.keyboard.down("Shift")
+    page.keyboard.down("KeyS")
+    page.wait_for_timeout(300)
+    page.keyboard.up("KeyS")
+    page.keyboard.up("Shift")
+    page.wait_for_timeout(150)
+    assert plane(page)[4] > after[4] + 2
+
+
+def test_the_small_drawing_takes_the_probe_and_can_be_hidden(opened, volume_file):
+    page = ready(opened(path=volume_file))
+    box, shown, before = page.locator("#stage").bounding_box(), picture(page), plane(page)
+    x, y = box["x"] + box["width"] - 140, box["y"] + box["height"] - 110
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 30, y - 20, steps=5)
+    page.mouse.up()
+    page.wait_for_timeout(200)
+    moved = plane(page)
+    assert moved[0] > before[0] + 1
+    assert moved[2] > before[2] + 1
+    assert depth(page) == 0, "and not the needle"
+    page.locator('[data-help="body"]').uncheck(force=True)
+    page.wait_for_timeout(200)
+    corner = picture(page)[-200:, -250:]
+    assert np.abs(corner - shown[-200:, -250:]).mean() > 3
+
+
+def test_the_guide_says_where_a_needle_across_would_pass_and_the_numbers_how_far_off_it_is(opened, volume_file):
+    page = ready(opened(path=volume_file))
+    push(page, 6)
+    page.keyboard.press("z")
+    page.locator("#probe-0").focus()
+    for _ in range(40):
+        page.keyboard.press("ArrowRight")
+    page.wait_for_timeout(300)
+    assert plane(page)[0] > 0
+    assert page.locator("#fault").is_hidden()

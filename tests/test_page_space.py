@@ -1,199 +1,175 @@
-"""Packs of scenes in space, and forced models of hostile packs: read whole or refused, and run by the native core as in Python."""
+"""Scenes in space as pages: their packs, the page's engine against the package, and the page in a browser."""
 
 from __future__ import annotations
 
-from pathlib import Path
+import json
+import shutil
+import subprocess
 
 import numpy as np
 import pytest
 
 import page_scene
-from echospline.errors import EchosplineError, InputError
-from echospline.page import Pack, packed_space
-from echospline.page.replay import tissue_of
-from echospline.scenario import Scenario, SpatialScene
+from echospline.errors import InputError
+from echospline.page import Pack, bundle, packed_space
+from echospline.page.packing_space import pose_of
+from echospline.picture import NeedleEcho
+from echospline.picture.slices import SliceDrawing
+from echospline.scenario import Scenario
 from echospline.scenario.space_models import build_spatial_model
-from echospline.scenario.space_scene import spatial_tissue
-from echospline.scene import NeedlePose, SpatialPose, Volume, probe_plane
-from test_page_pack import changed, put
+from echospline.scenario.space_scene import SpatialScene
+from echospline.scene import SpatialPose, Tissue, probe_plane
+from test_page_engine import NODE, WASM
+from test_slices import smooth_volume
 
-RNG = np.random.default_rng(9)
-
-
-def opened():
-    """A block of speckle, 24 x 20 x 16 mm, under a linear probe."""
-    scenario = Scenario().with_values(
-        {
-            "title": "Block",
-            "model.kind": "green",
-            "space.needle.entry": (0.0, 0.0, 0.0),
-            "space.needle.direction": (0.3, 0.9, 0.1),
-            "space.probe.position": (0.0, 0.0, 0.0),
-            "space.probe.yaw": 20.0,
-            "space.probe.depth": 18.0,
-            "space.probe.width": 20.0,
-        },
-        "test",
-    )
-    voxels = RNG.integers(0, 200, (32, 40, 48), dtype=np.uint8)
-    volume = Volume(voxels, (0.5, 0.5, 0.5), (-12.0, 0.0, -8.0))
-    return SpatialScene(scenario, volume, spatial_tissue(scenario), ())
+ALONG, ASIDE = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0], [2.0, 0.0, 1.0, 70.0, 10.0, -8.0]
+HANDS = [
+    [[-9.0, 0.0, 0.0], [-9.0, 0.0, 0.0], 10, ALONG],
+    [[-9.0, 0.0, 0.0], [0.0, 11.0, 1.0], 70, ALONG],
+    [[-9.0, 0.0, 0.0], [3.0, 14.0, 2.0], 50, ASIDE],
+]
 
 
-@pytest.fixture(scope="module")
-def scene():
-    return opened()
+def opened(kind: str = "green", shape: str = "linear") -> SpatialScene:
+    values = {
+        "model.kind": kind,
+        "space.mesh.nodes": (9, 9, 9),
+        "space.probe.shape": shape,
+        "space.probe.width": 24.0,
+        "space.probe.radius": 30.0,
+        "space.probe.opening": 45.0,
+        "space.probe.depth": 24.0,
+        "space.probe.pixel": 0.2,
+        "space.needle.entry": (-9.0, 0.0, 0.0),
+        "space.needle.direction": (0.6, 0.8, 0.0),
+    }
+    return SpatialScene(Scenario().with_values(values, "test"), smooth_volume(), Tissue(10.0, 0.45), ())
 
 
-@pytest.fixture(scope="module")
-def pack(scene):
-    return packed_space(scene)
+@pytest.fixture(scope="module", params=[("green", "linear"), ("green", "curved"), ("elastic", "linear")], ids="-".join)
+def case(request):
+    kind, shape = request.param
+    scene = opened(kind, shape)
+    return kind, scene, packed_space(scene)
 
 
-@pytest.fixture(scope="module")
-def data(pack):
-    return pack.to_bytes()
+# --- packs
 
 
-def test_a_pack_in_space_comes_back_from_its_bytes(scene, pack, data):
-    read = Pack.from_bytes(data)
-    assert read.digest == pack.digest
-    assert read.to_bytes() == data
-    assert read.dimension == 3
-    np.testing.assert_array_equal(read.arrays["voxels"], scene.volume.voxels)
-    m = read.manifest
-    space = scene.scenario.space
-    wanted = space.probe.planes(space.needle.insertion()).at(0.0)
-    x, y, z, yaw, pitch, roll = m.probe.pose
-    np.testing.assert_allclose(probe_plane((x, y, z), yaw, pitch, roll).matrix, wanted.matrix, atol=1e-12)
-    assert m.models[0].name == "green"
+def test_a_pack_in_space_is_read_as_it_was_written(case):
+    _, scene, pack = case
+    again = Pack.from_bytes(pack.to_bytes())
+    assert again.manifest == pack.manifest
+    assert again.dimension == 3
+    np.testing.assert_array_equal(again.arrays["voxels"], scene.volume.voxels)
 
 
-@pytest.mark.parametrize("kind", ["green", "elastic"])
-def test_tissue_of_a_pack_in_space_moves_as_pythons_own(scene, data, kind):
-    read = Pack.from_bytes(data)
-    tissue = tissue_of(read, read.model(kind))
-    own = build_spatial_model(
-        scene.scenario, scene.scenario.space.grid(scene.volume), scene.tissue, kind=kind
-    )
-    state, exact = tissue.rest(), own.rest()
-    entry, way = np.array(read.manifest.needle.entry), np.array(read.manifest.needle.direction)
-    for k in range(1, 40):
-        pose = SpatialPose(tuple(entry), tuple(entry + 0.3 * k * way), 36.0)
-        state, exact = tissue.advance(state, pose, 1 / 120), own.advance(exact, pose, 1 / 120)
-        if k == 25:
-            early = state
-    points = entry + way * np.linspace(1.0, 14.0, 8)[:, None] + [0.0, 0.0, 0.4]
-    moved = own.field(exact)(points)
-    assert np.abs(moved).max() > 0.05
-    np.testing.assert_allclose(tissue.displacement_at(state, points), moved, atol=2e-4)
-    back = tissue.displacement_at(early, points)  # an earlier state goes on as it was
-    assert np.abs(back - moved).max() > 1e-3
-    np.testing.assert_array_equal(
-        tissue.displacement_at(state, points), tissue.displacement_at(state, points)
-    )
-
-
-HOSTILE = {
-    "no probe": (lambda tree: tree.pop("probe") and tree, "a probe"),
-    "an image as well": (put("image", {"columns": 2, "rows": 2, "spacing": [1, 1], "origin": [0, 0], "pixels": "voxels"}), "an image"),
-    "a volume larger than its array": (put("volume", "shape", [48, 40, 33]), "volume"),
-    "a mesh of the plane": (put("mesh", "shape", [4, 4]), "mesh|image"),
-    "a probe of another shape": (put("probe", "shape", "round"), "shape"),
-    "a pose of five numbers": (put("probe", "pose", [0, 0, 0, 0, 0]), "pose"),
-    "corners of another mesh": (put("models", 0, "response", "low", [0, 0, 0]), "low"),
-    "a corner that is a number": (put("models", 0, "response", "high", 3), "high"),
-    "a lattice of two axes": (put("models", 0, "response", "lattice_shape", [4, 4]), "needs 3 numbers"),
-    "no stiffness": (lambda tree: tree["models"][0]["response"].pop("poisson") and tree, "poisson"),
-    "an unknown number": (put("models", 0, "response", "level", 9), "level"),
-    "a law that is none": (put("models", 0, "options", "source_count", 10**9), "options of a forced tissue"),
-    "a table under another name": (put("models", 0, "arrays", {"sources": "green.answers", "conditions": "green.sources", "condition_faces": "green.condition_faces", "answers": "green.conditions"}), "fit"),
-    "needle in the plane": (put("needle", "entry", [0.0, 0.0]), "3 numbers"),
-    "exercises": (put("exercises", [page_scene.EXERCISE.model_dump(mode="json")]), "no exercises"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", HOSTILE)
-def test_a_hostile_pack_in_space_is_refused_in_one_sentence(data, name):
-    change, said = HOSTILE[name]
-    with pytest.raises(InputError, match=said) as refused:
-        Pack.from_bytes(changed(data, change))
-    assert len(str(refused.value).splitlines()) == 1
-    assert len(str(refused.value)) < 500
-
-
-def run(pack):
-    """Step the first model; a refusal in words is an end as good as a number."""
-    D = pack.dimension
-    try:
-        tissue = tissue_of(pack, pack.manifest.models[0])
-        state = tissue.rest()
-        entry, way = np.array(pack.manifest.needle.entry), np.array(pack.manifest.needle.direction)
-        for k in range(1, 8):
-            tip = tuple(entry + 0.5 * k * way)
-            pose = NeedlePose(tuple(entry), tip, 60.0) if D == 2 else SpatialPose(tuple(entry), tip, 60.0)
-            state = tissue.advance(state, pose, 1 / 120)
-        tissue.displacement_at(state, entry[None] + way)
-    except EchosplineError as error:
-        return str(error)
-    return ""
-
-
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_tables_with_wild_numbers_end_in_a_step_or_a_sentence(pack, dimension):
-    """The core reads tables of strangers: indices, sizes and places that make no sense crash nothing."""
-    whole = page_scene.small(**{"model.kind": "green"}) if dimension == 2 else pack
-    assert run(whole) == ""
-    model = whole.manifest.models[0]
-    assert model.kind == "forced"
+def test_the_pose_of_a_plane_is_what_places_the_probe_there():
     rng = np.random.default_rng(4)
-    ends = {"stepped": 0, "refused": 0}
-    for _ in range(60):
-        arrays = dict(whole.arrays)
-        role = str(rng.choice(sorted(model.arrays)))
-        name = model.arrays[role]
-        array = np.array(arrays[name])
-        wild = rng.choice(
-            [-1, 0, 1, 7, 255, 2**31 - 1, -(2**31)]
-            if array.dtype.kind in "iu"
-            else [0.0, -1.0, 1e-300, 1e9, -1e300, 1e300]
-        )
-        if array.dtype == np.uint8:
-            wild = abs(int(wild)) % 256
-        with np.errstate(over="ignore"):
-            array.flat[rng.integers(0, array.size, 3)] = (
-                np.clip(wild, -3e38, 3e38) if array.dtype == np.float32 else wild
-            )
-        arrays[name] = array
-        try:
-            said = run(Pack(whole.manifest, arrays))
-        except InputError as error:
-            said = str(error)
-        ends["refused" if said else "stepped"] += 1
-    assert min(ends.values()) > 0, ends
+    for _ in range(50):
+        given = [*rng.uniform(-20, 20, 3), rng.uniform(-180, 180), *rng.uniform(-80, 80, 2)]
+        np.testing.assert_allclose(pose_of(probe_plane(given[:3], *given[3:])), given, atol=1e-9)
 
 
-def test_a_number_of_the_response_out_of_its_range_is_said():
-    data = page_scene.small(**{"model.kind": "green"}).to_bytes()
-    for key, value in (
-        ("radius", 0.0),
-        ("radius", -1.0),
-        ("weight", -1.0),
-        ("band_count", 10**6),
-        ("clamped", 4096),
-        ("method", 77),
-    ):
-        try:
-            said = run(Pack.from_bytes(changed(data, put("models", 0, "response", key, value))))
-        except InputError as error:
-            said = str(error)
-        assert said, key
+@pytest.mark.parametrize(
+    "harm",
+    [
+        {"volume": None},
+        {"probe": None},
+        {"volume.shape": [47, 48, 48]},
+        {"mesh.shape": [9, 9]},
+        {"needle.entry": [0.0, 0.0]},
+        {"models.0.response.low": [0.0, 0.0, 0.0]},
+        {"models.0.arrays.answers": "green.sources"},
+        {"exercises": [page_scene.EXERCISE.model_dump(mode="json")]},
+    ],
+    ids=lambda harm: next(iter(harm)),
+)
+def test_a_pack_in_space_that_does_not_fit_is_refused(harm):
+    import struct  # noqa: PLC0415
+
+    data = packed_space(opened()).to_bytes()
+    (length,) = struct.unpack_from("<I", data, 8)
+    head = json.loads(data[12 : 12 + length])
+    for path, value in harm.items():
+        *way, last = [int(part) if part.isdigit() else part for part in path.split(".")]
+        place = head
+        for part in way:
+            place = place[part]
+        place[last] = value
+    text = json.dumps(head).encode()
+    start = 12 + length + -(12 + length) % 8
+    bad = b"ECHOPACK" + struct.pack("<I", len(text)) + text
+    bad += bytes(-len(bad) % 8) + data[start:]
+    with pytest.raises(InputError):
+        Pack.from_bytes(bad)
 
 
-def test_the_shipped_spine_is_packed(tmp_path):
-    from echospline.scenario import open_spatial  # noqa: PLC0415
+# --- the engine
 
-    scenario = Scenario().with_values({"image.file": "sample:spine"}, "test")
-    whole = packed_space(open_spatial(scenario, Path()))
-    assert [model.name for model in whole.manifest.models][0] == "green"
-    assert run(whole) == ""
+
+@pytest.mark.skipif(NODE is None or not WASM.exists(), reason="Node or echospline.wasm is missing")
+def test_the_pages_engine_moves_tissue_and_draws_planes_as_the_package_does(case, tmp_path):
+    kind, scene, pack = case
+    (tmp_path / "scene.pack").write_bytes(pack.to_bytes())
+    out = tmp_path / "out"
+    done = subprocess.run(
+        [NODE, "tests/node/run_engine.mjs", str(tmp_path / "scene.pack"), kind, json.dumps(HANDS), str(out)],
+        cwd=page_scene.ROOT, capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    space = scene.scenario.space
+    probe, grid = space.probe.probe(), space.grid(scene.volume)
+    columns, rows = probe.grid.shape
+    poses = np.fromfile(f"{out}.poses").reshape(-1, 7)
+    fields = np.fromfile(f"{out}.fields").reshape(len(poses) // 10, -1, 3)
+    pictures = np.fromfile(f"{out}.grey", np.uint8).reshape(len(HANDS), rows, columns)
+    model = build_spatial_model(scene.scenario, grid, scene.tissue, kind=kind)
+    drawing, state = SliceDrawing(scene.volume, probe), model.rest()
+    ends = np.cumsum([steps for _, _, steps, _ in HANDS]).tolist()
+    moved = 0.0
+    for k, row in enumerate(poses.tolist(), 1):
+        pose = SpatialPose(tuple(row[:3]), tuple(row[3:6]), row[6])
+        state = model.advance(state, pose, 1 / 120)
+        if k % 10 == 0:
+            expected = model.field(state)(grid.nodes)
+            np.testing.assert_allclose(fields[k // 10 - 1], expected, rtol=0, atol=1e-4)
+            moved = max(moved, float(np.abs(expected).max()))
+        if k in ends:
+            plane = HANDS[ends.index(k)][3]
+            drawn = drawing.draw(
+                probe_plane(plane[:3], *plane[3:]), model.field(state), pose,
+                NeedleEcho() if pose.depth > 1e-9 else None,
+            ).image.pixels  # fmt: skip
+            apart = np.abs(pictures[ends.index(k)].astype(int) - drawn.astype(int))
+            assert apart.max() <= 1, f"{apart.max()} grey levels at {np.unravel_index(apart.argmax(), apart.shape)}"
+    assert moved > 0.1
+
+
+@pytest.mark.skipif(NODE is None, reason="Node is not installed")
+def test_planes_of_the_page_are_those_of_the_package(tmp_path):
+    rng = np.random.default_rng(6)
+    poses = [[*rng.uniform(-20, 20, 3), rng.uniform(-180, 180), *rng.uniform(-80, 80, 2)] for _ in range(20)]
+    script = f"""import {{ planeMatrix, lowered, raised, poseOfMatrix, turnedBy }} from "{page_scene.ROOT}/src/echospline/page/static/probe.js";
+    const poses = {json.dumps(poses)};
+    console.log(JSON.stringify(poses.map((pose, k) => {{
+      const m = planeMatrix(pose), p = [3, 4, 5];
+      return {{ m, back: poseOfMatrix(m), round: lowered(m, raised(m, p)), twice: planeMatrix(turnedBy(pose, [10, -5, k])) }};
+    }})));"""
+    (tmp_path / "planes.mjs").write_text(script)
+    done = subprocess.run([NODE, str(tmp_path / "planes.mjs")], capture_output=True, text=True, timeout=60, check=True)
+    for k, (pose, found) in enumerate(zip(poses, json.loads(done.stdout), strict=True)):
+        matrix = probe_plane(pose[:3], *pose[3:]).matrix
+        np.testing.assert_allclose(found["m"], matrix.ravel(), atol=1e-12)
+        np.testing.assert_allclose(found["back"], pose, atol=1e-9)
+        np.testing.assert_allclose(found["round"], [3, 4, 5], atol=1e-9)
+        turn = probe_plane((0.0, 0.0, 0.0), 10.0, -5.0, float(k)).matrix
+        np.testing.assert_allclose(found["twice"], (matrix @ turn).ravel(), atol=1e-9)
+
+
+def test_the_page_of_a_volume_is_one_file(tmp_path):
+    if not WASM.exists() or shutil.which("node") is None:
+        pytest.skip("echospline.wasm is not built")
+    html = bundle(packed_space(opened()))
+    assert 'id="scene"' in html
+    assert len(html) < 12_000_000

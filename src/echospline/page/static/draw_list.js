@@ -217,7 +217,7 @@ function readouts(view, state, live, seen, shown, toTarget, say) {
     const left = secondsLeft(state);
     line(clock(left), left <= LOW_TIME ? VESSEL : INK, 22, true);
   }
-  if (state.frozen) line(say("frozen"), TARGET, 13, true);
+  if (state.frozen) line(say(state.comparing ? "fem-shown" : "frozen"), TARGET, 13, true);
   if (!shown) return drawn;
   const D = state.low.length, depth = Math.hypot(...state.low.map((_, d) => live.tip[d] - live.entry[d]));
   line(`${say("depth-short")} ${depth.toFixed(1)} mm`, INK, 13);
