@@ -93,7 +93,8 @@ def test_a_trainee_sees_the_own_sessions_of_the_own_browser_and_experts_without_
     assert [(s["id"], s["trainee"]) for s in answer["experts"]] == [(7, ""), (8, "")]
     (group,) = answer["curves"]
     assert [one["trainee"] for one in group["trainees"]] == ["Ann"]
-    assert set(group) == {"scene", "exercise", "trainees"}  # no median of others
+    assert set(group) == {"scene", "exercise", "trainees", "expert"}  # no median of others
+    assert group["expert"]["sessions"] == [7, 8]
     said = json.dumps(answer)
     for other in ("Ben", "Eve", "Dr. X", "=cmd", ANN, BEN):
         assert other not in said

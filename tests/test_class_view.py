@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import time
 from dataclasses import replace
 
 import pytest
@@ -69,8 +70,16 @@ def class_of(path, pack, rows):
     return stored
 
 
+def until(page, expression, seconds=20.0):
+    """Wait until an expression is true in the page; its policy refuses Playwright's own way."""
+    end = time.monotonic() + seconds
+    while not page.evaluate(expression):
+        assert time.monotonic() < end, f"never true: {expression}"
+        page.wait_for_timeout(30)
+
+
 @pytest.fixture
-def opened(browser, tmp_path):
+def opened(browser, tmp_path, request):
     """Open the harness over a filled class; fails the test on any fault in the page."""
     pack, rows = page_scene.small(), page_scene.poses()
     stored = class_of(tmp_path / "class.sqlite", pack, rows)
@@ -84,7 +93,7 @@ def opened(browser, tmp_path):
 
     routes = [Route("/", page_file), Route("/harness.js", harness), Mount("/static", StaticFiles(directory=STATIC))]  # fmt: skip
     faults = []
-    with served(tmp_path / "class.sqlite", pack, alone=True, more=routes) as ask:
+    with served(tmp_path / "class.sqlite", pack, alone=getattr(request, "param", True), more=routes) as ask:
         forged = honest(pack, rows, trainee="Ann")
         forged["score"]["time"] = 1.0
         ask("POST", "/api/sessions", json.dumps(forged).encode())
@@ -127,14 +136,14 @@ def test_an_instructor_sees_the_class_chooses_and_marks(opened):
     expect(dialog.locator("table").nth(1).locator("tbody tr").nth(1).get_by_text("Benchmark")).to_have_attribute("aria-pressed", "true")  # fmt: skip
     assert stored.find(number).expert is True
     dialog.locator("table").nth(1).locator("tbody tr").nth(1).get_by_text("Beside me").click()
-    page.wait_for_function("window.beside.length === 1")
+    until(page, "window.beside.length === 1")
     assert page.evaluate("window.beside[0].steps") == 360
     with page.expect_download() as download:
         dialog.get_by_text("Curves as CSV").click()
     assert download.value.suggested_filename == "echospline-curves.csv"
     assert download.value.path().read_text().startswith("scene,exercise,trainee")
     dialog.locator("table").nth(1).locator("tbody tr").nth(1).get_by_text("Replay").click()
-    page.wait_for_function("window.replayed.length === 1")
+    until(page, "window.replayed.length === 1")
     expect(dialog).not_to_be_visible()
 
 
@@ -160,3 +169,25 @@ def test_it_speaks_german_and_closes_by_the_keyboard(opened):
     expect(page.locator("#class")).to_contain_text("Die Klasse")
     page.keyboard.press("Escape")
     expect(page.locator("#class")).not_to_be_visible()
+
+
+@pytest.mark.parametrize("opened", [False], indirect=True)
+def test_a_trainee_sees_the_own_sessions_and_experts_alone(opened):
+    page, stored = opened
+    rows = page_scene.poses()
+    expect(page.locator("#class [role=alert]")).to_contain_text("instructor alone")
+    body = json.dumps(honest(page_scene.small(), rows, trainee="Ann", started="2026-03-05T10:00:00Z"))
+    page.evaluate("(body) => fetch('api/sessions', { method: 'POST', body }).then((a) => a.text())", body)
+    page.evaluate("window.view.open('Ann')")
+    dialog = page.locator("#class")
+    expect(dialog).to_contain_text("My sessions on the server")
+    dialog.locator("select").first.select_option(index=1)
+    expect(dialog.locator("table").nth(1).locator("tbody tr")).to_have_count(1)
+    for others in (EVIL, "Ben", "Dr. Expert", "median", "CSV", "Benchmark"):
+        expect(dialog).not_to_contain_text(others)
+    dialog.locator("select").first.select_option(index=0)
+    expect(dialog.locator("table").nth(1).locator("tbody tr")).to_have_count(3)  # the experts'
+    dialog.locator("table").nth(1).locator("tbody tr").first.get_by_text("Replay").click()
+    until(page, "window.replayed.length === 1")
+    assert page.evaluate("window.replayed[0].trainee") == ""
+    assert stored.every()[-1].trainee == "Ann"

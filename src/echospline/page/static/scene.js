@@ -87,7 +87,7 @@ export function readExercise(value, what, dimension) {
   const entry = asRecord(value, what);
   const ball = (/** @type {unknown} */ at, /** @type {string} */ name) => {
     const b = asRecord(at, name);
-    return { centre: asNumbers(b.centre, `${name}.centre`, dimension), radius: asNumber(b.radius, `${name}.radius`, 1e-6, 100) };
+    return { ...b, centre: asNumbers(b.centre, `${name}.centre`, dimension), radius: asNumber(b.radius, `${name}.radius`, 1e-6, 100) };
   };
   const most = entry.most_redirections ?? null, attempts = entry.attempts ?? null, help = entry.help ?? true;
   if (typeof help !== "boolean") throw new PackError(`Expected true or false for ${what}.help; got ${shown(help)}.`);
