@@ -11,7 +11,7 @@ const LONGEST_MANIFEST = 4 << 20; // bytes
 const ARRAY_TYPES = { uint8: Uint8Array, float32: Float32Array, float64: Float64Array, int32: Int32Array, int64: BigInt64Array };
 
 /** @typedef {[number, number]} Point (x lateral, y depth), mm */
-/** @typedef {{ centre: number[], radius: number }} Ball round structure, a disc in the plane; mm */
+/** @typedef {{ centre: number[], radius: number, [extra: string]: any }} Ball round structure, a disc in the plane; mm */
 /**
  * `help` false takes rings, guide and readouts away; `entry` is where the needle enters, `entry_between` where it is drawn by lot (mm); `attempts` a trainee has.
  * @typedef {{
@@ -87,7 +87,7 @@ export function readExercise(value, what, dimension) {
   const entry = asRecord(value, what);
   const ball = (/** @type {unknown} */ at, /** @type {string} */ name) => {
     const b = asRecord(at, name);
-    return { centre: asNumbers(b.centre, `${name}.centre`, dimension), radius: asNumber(b.radius, `${name}.radius`, 1e-6, 100) };
+    return { ...b, centre: asNumbers(b.centre, `${name}.centre`, dimension), radius: asNumber(b.radius, `${name}.radius`, 1e-6, 100) };
   };
   const most = entry.most_redirections ?? null, attempts = entry.attempts ?? null, help = entry.help ?? true;
   if (typeof help !== "boolean") throw new PackError(`Expected true or false for ${what}.help; got ${shown(help)}.`);
