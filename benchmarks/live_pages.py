@@ -89,7 +89,9 @@ def session(pack: Pack, model: str, seconds: float) -> bytes:
     rate, (x, y) = pack.manifest.rate, pack.manifest.needle.entry
     depth = 12.0 * (1 - np.cos(np.linspace(0, 6 * np.pi, round(rate * seconds)))) / 2
     speed = np.diff(depth, prepend=0.0) * rate
-    rows = np.column_stack([np.full_like(depth, x), np.full_like(depth, y), np.full_like(depth, x), y + depth, speed])
+    rows = np.column_stack(
+        [np.full_like(depth, x), np.full_like(depth, y), np.full_like(depth, x), y + depth, speed]
+    )
     told = {
         "format": 1, "kind": "echospline session", "version": "0", "core": "0" * 64, "scene": {"title": pack.manifest.title, "pack": pack.digest},
         "model": model, "exercise": pack.manifest.exercises[0].model_dump(mode="json"), "trainee": "Bench", "attempt": 1,
@@ -132,7 +134,9 @@ def hand_in(address: str, pid: int) -> None:
     for model in [model.name for model in pack.manifest.models]:
         body = session(pack, model, 60.0)
         before, begun = processor(pid), time.monotonic()
-        with urllib.request.urlopen(urllib.request.Request(f"{address}api/sessions", body, method="POST")) as answer:
+        with urllib.request.urlopen(
+            urllib.request.Request(f"{address}api/sessions", body, method="POST")
+        ) as answer:
             told = json.load(answer)
         assert told["verified"], told
         print(

@@ -38,6 +38,7 @@ from echospline.viewer.class_answers import (
 from echospline.viewer.class_routes import COOKIE, Classroom, Instructor, class_routes
 from echospline.viewer.guard import Guard
 from echospline.viewer.learning_curve import learning_curve
+from echospline.viewer.served_scene import Scene
 from test_page_replay import honest
 from test_sessions import trace_of
 
@@ -92,7 +93,8 @@ def test_a_trainee_sees_the_own_sessions_of_the_own_browser_and_experts_without_
     assert [(s["id"], s["trainee"]) for s in answer["experts"]] == [(7, ""), (8, "")]
     (group,) = answer["curves"]
     assert [one["trainee"] for one in group["trainees"]] == ["Ann"]
-    assert set(group) == {"scene", "exercise", "trainees"}  # no median of others
+    assert set(group) == {"scene", "exercise", "trainees", "expert"}  # no median of others
+    assert group["expert"]["sessions"] == [7, 8]
     said = json.dumps(answer)
     for other in ("Ben", "Eve", "Dr. X", "=cmd", ANN, BEN):
         assert other not in said
@@ -172,15 +174,16 @@ def test_the_pages_reader_takes_this_answer(sessions):
 
 
 @contextmanager
-def served(path, pack, *, token=None, instructor=None, alone=False):
-    """Serve the routes of a class alone; yields a function that asks."""
-    classroom = Classroom(
-        Sessions(path),
-        lambda digest: (pack, "upload") if digest == pack.digest else None,
-        Instructor(instructor, alone),
-    )
+def served(path, pack, *, token=None, instructor=None, alone=False, more=()):
+    """Serve the routes of a class, and others; yields a function that asks."""
+    scene = Scene(pack, upload="upload")
+
+    async def scene_of(digest):
+        return scene if digest == pack.digest else None
+
+    classroom = Classroom(Sessions(path), scene_of, Instructor(instructor, alone))
     app = Starlette(
-        routes=class_routes(classroom),
+        routes=[*class_routes(classroom), *more],
         middleware=[
             Middleware(
                 Guard,
@@ -204,6 +207,7 @@ def served(path, pack, *, token=None, instructor=None, alone=False):
         connection.close()
         return response.status, data, dict(response.getheaders())
 
+    ask.address = f"http://127.0.0.1:{port}"
     try:
         yield ask
     finally:

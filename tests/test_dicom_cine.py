@@ -22,7 +22,9 @@ COLOUR = RNG.integers(0, 256, (3, 20, 30, 3), dtype=np.uint8)
 
 @pytest.mark.parametrize("frames", [GREY, GREY[:1], COLOUR], ids=["grey", "one", "colour"])
 def test_pydicom_reads_every_pixel_and_the_pace(frames):
-    read = pydicom.dcmread(io.BytesIO(dicom_cine(frames, 24.0, (0.2, 0.1), title="Calf \\ 1", when=datetime(2026, 3, 1, 10, 20))))
+    read = pydicom.dcmread(
+        io.BytesIO(dicom_cine(frames, 24.0, (0.2, 0.1), title="Calf \\ 1", when=datetime(2026, 3, 1, 10, 20)))
+    )
     np.testing.assert_array_equal(np.squeeze(read.pixel_array), np.squeeze(frames))
     assert read.SOPClassUID.name == "Ultrasound Multi-frame Image Storage"
     assert int(read.NumberOfFrames) == len(frames)
@@ -65,7 +67,8 @@ def test_what_no_file_can_hold_is_refused(frames, rate, spacing, match):
 HEAD = {"columns": 47, "rows": 33, "frames": 5, "spacing": [0.2, 0.1], "title": "Calf"}
 
 
-def sent(head=HEAD, pixels=GREY.tobytes()):
+def sent(head=HEAD, pixels=None):
+    pixels = GREY.tobytes() if pixels is None else pixels
     return json.dumps(head).encode() + b"\n" + pixels
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sqlite3
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from echospline.viewer.session_schema import SCHEMA_VERSION
 from test_page_replay import honest
 
 EXERCISE = page_scene.EXERCISE
+NODE = shutil.which("node")
 OLD = """CREATE TABLE session (id INTEGER PRIMARY KEY, started TEXT NOT NULL, trainee TEXT NOT NULL, exercise TEXT NOT NULL,
 definition TEXT NOT NULL, scene TEXT NOT NULL, source TEXT NOT NULL, model TEXT NOT NULL, score TEXT NOT NULL, trace BLOB NOT NULL{})"""
 COLUMNS = {
@@ -294,6 +296,43 @@ def test_an_entry_that_is_given_is_that_of_the_motion(rows, rules, said):
 def test_rules_that_cannot_be_kept_are_refused(rules, said):
     with pytest.raises(InputError, match=said):
         page_scene.small(exercise=[{**EXERCISE.model_dump(), **rules}])
+
+
+READING = """
+import { readExercise } from "./src/echospline/page/static/scene.js";
+let text = "";
+for await (const part of process.stdin) text += part;
+process.stdout.write(JSON.stringify(JSON.parse(text).map((exercise) => readExercise(exercise, "exercise", 2))));
+"""
+
+
+@pytest.mark.skipif(NODE is None, reason="Node is not installed: the page's reader is not compared")
+def test_the_page_hands_every_key_of_an_exercise_on_as_it_was():
+    """Or a session's exercise would not be that of its scene."""
+    exercises = [
+        Exercise.model_validate({**EXERCISE.model_dump(), **more}).model_dump(mode="json")
+        for more in (
+            {},
+            {
+                "help": False,
+                "entry": (8.0, 0.0),
+                "attempts": 3,
+                "time_limit": 12.5,
+                "most_redirections": None,
+            },
+            {"entry_between": (4.0, 9.0)},
+            {
+                "target": {"centre": (5.0, 6.0), "radius": 1.0, "imaged": True, "young": 40.0},
+                "vessels": [{"centre": (9.0, 6.0), "radius": 1.5, "echo": "hyperechoic"}],
+            },
+        )
+    ]
+    done = subprocess.run(
+        [NODE, "--input-type=module", "-e", READING],
+        input=json.dumps(exercises), cwd=page_scene.ROOT, capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == exercises
 
 
 # --- export, benchmarks, deletion

@@ -222,4 +222,4 @@ def test_the_example_course_opens_with_its_exercises():
     scenario, folder = scenario_from(str(EXAMPLES / "training.toml"), {"mesh.nodes": "12x9"})
     opened = scene_of(scenario, scenario.read_image(folder), folder)
     assert opened.title == "Calf: biopsy course"
-    assert [len(exercise.vessels) for exercise in opened.pack.manifest.exercises] == [0, 0, 2]
+    assert [len(exercise.vessels) for exercise in opened.pack.manifest.exercises] == [0, 0, 2, 2]

@@ -160,7 +160,6 @@ def test_a_session_of_another_scene_is_not_stored(server):
     status, said = post(address, "/api/sessions", recorded(pack("Another")))
     assert status == 422
     assert "a scene that this server does not have: export it" in said
-    assert "echospline sessions" not in said
     assert len(sessions.newest()) == before
 
 
@@ -246,7 +245,7 @@ def test_finite_elements_follow_the_poses_of_a_page(address):
         state = model.advance(state, NeedlePose((x, y), (tx, ty), speed), dt)
     exact = model.displacement(state)
     assert np.abs(exact).max() > 0.1
-    np.testing.assert_allclose(moved, exact, atol=0.02 * np.abs(exact).max())
+    np.testing.assert_allclose(moved, exact, atol=1e-6)
 
 
 @pytest.mark.parametrize(

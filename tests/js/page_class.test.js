@@ -70,11 +70,21 @@ test("sessions are listed by exercise, scene and trainee, newest first, with why
   assert.deepEqual(classSessions(answer, null, "Ann").map(({ id }) => id), [5, 3, 1]);
   assert.deepEqual(traineesOf(answer, group), ["Ann", "Ben"]);
   const cells = answer.sessions.map((one) => classCells(one, say, "en"));
-  assert.equal(cells[0][8], "same numbers");
-  assert.match(cells[2][8], /does not count: time is 4/);
-  assert.match(cells[1][5], /^Not passed · Ended by Reset/);
-  assert.equal(cells[1][6], "–");
-  assert.equal(cells[3][2], "no name");
+  assert.equal(cells[0][7], "same numbers");
+  assert.match(cells[2][7], /does not count: time is 4/);
+  assert.match(cells[1][4], /^Not passed · Ended by Reset/);
+  assert.equal(cells[1][5], "–");
+  assert.equal(cells[3][2], "expert");
+});
+
+test("a trainee's answer has no median of others, and experts without a name", () => {
+  const given = answered(), [group] = given.curves, { median, ...alone } = { ...group, trainees: group.trainees.slice(0, 1) };
+  assert.ok(median);
+  const answer = readClass({ ...given, sessions: given.sessions.filter(({ trainee }) => trainee === "Ann"), experts: [session(4, "", { expert: true })], curves: [alone] });
+  const chart = classChart(answer, answer.groups[0], "final_error", "Ann", say, "dark");
+  assert.deepEqual(chart.lines.map(({ label }) => label), ["Ann"]);
+  assert.equal(chart.level, 0.5);
+  assert.deepEqual(classSessions(answer, answer.groups[0], null).map((one) => classCells(one, say, "en")[2]), ["expert", "Ann", "Ann"]);
 });
 
 test("an answer that is no class is refused in a sentence", () => {

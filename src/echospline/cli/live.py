@@ -125,10 +125,19 @@ def live(
     from threadpoolctl import threadpool_limits
 
     scenario, folder = scenario_from(source, changes or {})
-    scenario, image = scenario.opened(folder, eight_bit=True)
-    say([*image.notes, *scenario.label_notes(folder)], "note")
-    say(scenario_room.size_doubts(image.grid))
-    scene = scene_of(scenario, image, folder, language=language, rate=rate)
+    opened = None
+    if scenario_room.is_spatial(scenario):
+        if link or link_connect:
+            raise InputError("live follows a tracker in scenes of the plane alone: leave --link out in space")
+        opened = scenario_room.open_spatial(scenario, folder)
+        say(opened.notes, "note")
+        scene = viewer.Scene(page_room.packed_space(opened, language=language, rate=rate))
+    else:
+        scenario, image = scenario.opened(folder, eight_bit=True)
+        say([*image.notes, *scenario.label_notes(folder)], "note")
+        say(scenario_room.size_doubts(image.grid))
+        scene = scene_of(scenario, image, folder, language=language, rate=rate)
+    opener = None if opened is not None else opener_for(scenario, language=language, rate=rate)
     settings = viewer.Settings(host, port, clients, origins=tuple(origin or ()), open_door=not token)
     console = Console(stderr=True)
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
@@ -143,7 +152,7 @@ def live(
 
     with ExitStack() as stack:
         kept = _kept(sessions, stack, lambda text: console.print(text, highlight=False, soft_wrap=True))
-        app = viewer.build_app(scene, kept, settings, opener_for(scenario, language=language, rate=rate))
+        app = viewer.build_app(scene, kept, settings, opener)
         # an engine's step is short: more threads make it slower and less punctual
         stack.enter_context(threadpool_limits(limits=1))
         if link or link_connect:

@@ -57,7 +57,7 @@ def list_(
         "attempt",
         "model",
         "result",
-        "tip to target mm",
+        "tip mm",
         "time s",
         "verified",
     )
@@ -71,9 +71,12 @@ def list_(
         table.add_row(
             str(s.id), s.started[:16].replace("T", " "), _printable(s.trainee) + (" (expert)" if s.expert else ""),
             _printable(s.exercise), str(s.attempt), _printable(s.model), result, "-" if error is None else f"{error:.2f}",
-            f"{s.score['time']:.1f}", {True: "yes", None: "-"}.get(s.verified, f"no: {_printable(s.difference)}"),
+            f"{s.score['time']:.1f}", {True: "yes", False: "no", None: "-"}[s.verified],
         )  # fmt: skip
     Console().print(table, markup=False)
+    for s in found:
+        if s.difference:
+            print(f"{s.id} does not count: {_printable(s.difference)}")
 
 
 @sessions.command()
@@ -109,9 +112,9 @@ def curve(
         "trainee",
         "attempts",
         "passed",
-        f"LC-CUSUM of {threshold:.2f}",
-        "group's median",
-        "last tip to target mm",
+        f"LC-CUSUM (of {threshold:.2f})",
+        "median",
+        "last tip mm",
         "expert mm",
         "proficient",
     )
@@ -332,9 +335,10 @@ def _of(sessions: list[viewer.Session], trainee: str | None, exercise: str | Non
 
 
 def _table(title: str, columns: tuple[str, ...]) -> Table:
+    from rich.box import SIMPLE
     from rich.table import Table
 
-    table = Table(title=title, title_justify="left")
+    table = Table(title=title, title_justify="left", box=SIMPLE, pad_edge=False, padding=(0, 1, 0, 0))
     for name in columns:
         table.add_column(name)
     return table

@@ -6,14 +6,16 @@ from datetime import datetime
 from importlib.metadata import version
 from io import BytesIO
 from math import isfinite
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from echospline.errors import InputError
 
-MULTIFRAME = "1.2.840.10008.5.1.4.1.1.3.1"
-"""SOP class: Ultrasound Multi-frame Image Storage."""
+if TYPE_CHECKING:
+    from pydicom.dataset import Dataset
+
 MOST_SIDE, MOST_BYTES = 65_535, 2**32 - 2
 CENTIMETRE, TISSUE, PLANE = 3, 1, 1
 """Codes of a region: its units, its data (tissue), its format (2-D)."""
@@ -49,18 +51,22 @@ def dicom_cine(
     """
     from pydicom.dataset import FileDataset, FileMetaDataset  # noqa: PLC0415 - io is loaded without it
     from pydicom.sequence import Sequence  # noqa: PLC0415
-    from pydicom.uid import ExplicitVRLittleEndian, generate_uid  # noqa: PLC0415
+    from pydicom.uid import (  # noqa: PLC0415
+        ExplicitVRLittleEndian,
+        UltrasoundMultiFrameImageStorage,
+        generate_uid,
+    )
 
     _check(frames, rate, spacing)
     n, rows, columns = frames.shape[:3]
     when = when or datetime.now()
     meta = FileMetaDataset()
-    meta.MediaStorageSOPClassUID = MULTIFRAME
+    meta.MediaStorageSOPClassUID = UltrasoundMultiFrameImageStorage
     meta.MediaStorageSOPInstanceUID = generate_uid()
     meta.TransferSyntaxUID = ExplicitVRLittleEndian
     meta.ImplementationVersionName = f"ECHOSPLINE {version('echospline')}"[:16]
     d = FileDataset("", {}, file_meta=meta, preamble=bytes(128))
-    d.SOPClassUID, d.SOPInstanceUID = MULTIFRAME, meta.MediaStorageSOPInstanceUID
+    d.SOPClassUID, d.SOPInstanceUID = UltrasoundMultiFrameImageStorage, meta.MediaStorageSOPInstanceUID
     d.StudyInstanceUID, d.SeriesInstanceUID = generate_uid(), generate_uid()
     d.SpecificCharacterSet = "ISO_IR 192"
     d.PatientName, d.PatientID, d.PatientBirthDate, d.PatientSex = "Simulated", "simulated", "", ""
@@ -92,8 +98,8 @@ def dicom_cine(
     return out.getvalue()
 
 
-def _region(rows: int, columns: int, spacing: tuple[float, float]) -> object:
-    from pydicom.dataset import Dataset  # noqa: PLC0415
+def _region(rows: int, columns: int, spacing: tuple[float, float]) -> Dataset:
+    from pydicom.dataset import Dataset  # noqa: PLC0415 - as above
 
     region = Dataset()
     region.RegionSpatialFormat, region.RegionDataType, region.RegionFlags = PLANE, TISSUE, 0

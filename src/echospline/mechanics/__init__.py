@@ -20,6 +20,7 @@ if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.mechanics.protocol import TissueModel
     from echospline.mechanics.spatial_force_model import SpatialForceModel
     from echospline.mechanics.spatial_landmark_model import SpatialLandmarkModel
+    from echospline.mechanics.spatial_scene import SpatialForcedScene, SpatialStep
     from echospline.mechanics.tps import Solver, TPSModel, anchors_for
 else:
     on_demand(__name__)
@@ -42,7 +43,9 @@ __all__ = [
     "NeoHookeanModel",
     "Solver",
     "SpatialForceModel",
+    "SpatialForcedScene",
     "SpatialLandmarkModel",
+    "SpatialStep",
     "TPSModel",
     "TPSParameters",
     "ThinPlate",

@@ -307,26 +307,14 @@ def _fault(error: ValidationError) -> str:
 
 def _check(pack: Pack) -> None:
     """Refuse a manifest and arrays that do not fit together."""
-    m, D = pack.manifest, pack.dimension
+    m = pack.manifest
     if set(pack.arrays) != set(m.arrays):
         raise InputError("the arrays of a pack are not those of its manifest")
     for name, part in m.arrays.items():
         array = pack.arrays[name]
         if array.dtype.name != part.dtype or list(array.shape) != part.shape:
             raise InputError(f"array {name!r} of a pack has another type or shape than its manifest says")
-    if not len(m.mesh.shape) == len(m.mesh.spacing) == len(m.mesh.origin) == D:
-        raise InputError(f"shape, spacing and origin of a pack's mesh need {D} numbers each")
-    if (m.image is None) != (D == 3) or (m.volume is None) != (D == 2) or (m.probe is None) != (D == 2):
-        raise InputError("a pack holds an image and a mesh of two axes, or a volume, a probe and a mesh of three")
-    if prod(m.mesh.shape) > MOST_NODES:
-        raise InputError(f"the mesh of a pack has at most {MOST_NODES} nodes; got {prod(m.mesh.shape)}")
-    if m.volume is not None:
-        shown = m.volume.voxels
-        _typed(pack, shown, "uint8", tuple(m.volume.shape[::-1]), "the volume")
-    else:
-        assert m.image is not None
-        shown = m.image.pixels
-        _typed(pack, shown, "uint8", (m.image.rows, m.image.columns), "the picture")
+    shown = _check_shown(pack)
     names = [model.name for model in m.models]
     if len(set(names)) < len(names):
         raise InputError(f"two models of a pack have one name: {', '.join(names)}")
@@ -335,24 +323,45 @@ def _check(pack: Pack) -> None:
     used = {shown, *(name for model in m.models for name in model.arrays.values())}
     if used != set(m.arrays):
         raise InputError(f"arrays of a pack that nothing uses: {', '.join(sorted(set(m.arrays) - used))}")
-    n = m.needle
+    _check_needle(m.needle, pack.dimension)
+    tables = {"needle.echo": m.needle.echo}
+    for model in m.models:
+        tables |= {model.name: model.options, f"{model.name}.response": model.response or {}}
+    for key, value in _numbers(tables):
+        if not isfinite(value):
+            raise InputError(f"{key} of a pack must be a finite number; got {value}")
+    if pack.dimension == 2:
+        check_exercises(m.exercises, pack.mesh)
+    elif m.exercises:
+        raise InputError("a pack in space holds no exercises yet")
+
+
+def _check_shown(pack: Pack) -> str:
+    """Refuse a mesh, picture or volume that do not fit; returns the array of what is shown."""
+    m, D = pack.manifest, pack.dimension
+    if not len(m.mesh.shape) == len(m.mesh.spacing) == len(m.mesh.origin) == D:
+        raise InputError(f"shape, spacing and origin of a pack's mesh need {D} numbers each")
+    if (m.image is None) != (D == 3) or (m.volume is None) != (D == 2) or (m.probe is None) != (D == 2):
+        raise InputError(
+            "a pack holds an image and a mesh of two axes, or a volume, a probe and a mesh of three"
+        )
+    if prod(m.mesh.shape) > MOST_NODES:
+        raise InputError(f"the mesh of a pack has at most {MOST_NODES} nodes; got {prod(m.mesh.shape)}")
+    if m.volume is not None:
+        _typed(pack, m.volume.voxels, "uint8", tuple(m.volume.shape[::-1]), "the volume")
+        return m.volume.voxels
+    assert m.image is not None
+    _typed(pack, m.image.pixels, "uint8", (m.image.rows, m.image.columns), "the picture")
+    return m.image.pixels
+
+
+def _check_needle(n: NeedlePart, D: int) -> None:
     if len(n.entry) != D or len(n.direction) != D:
         raise InputError(
             f"entry and direction of the needle need {D} numbers; got {n.entry} and {n.direction}"
         )
     if abs(sum(c * c for c in n.direction) - 1) > UNIT:
         raise InputError(f"the needle's direction must have length 1; got {n.direction}")
-    for key, value in _numbers(
-        {"needle.echo": n.echo}
-        | {model.name: model.options for model in m.models}
-        | {f"{model.name}.response": model.response or {} for model in m.models}
-    ):
-        if not isfinite(value):
-            raise InputError(f"{key} of a pack must be a finite number; got {value}")
-    if D == 2:
-        check_exercises(m.exercises, pack.mesh)
-    elif m.exercises:
-        raise InputError("a pack in space holds no exercises yet")
 
 
 def _numbers(tables: Mapping[str, Values]) -> Iterator[tuple[str, float]]:
@@ -363,40 +372,48 @@ def _numbers(tables: Mapping[str, Values]) -> Iterator[tuple[str, float]]:
 
 
 def _check_model(pack: Pack, model: ModelPart) -> None:
-    D, mesh = pack.dimension, pack.manifest.mesh
-    expected = {"dimension": D, "shape": mesh.shape, "spacing": mesh.spacing, "origin": mesh.origin}
     for name in model.arrays.values():
         if name not in pack.arrays:
             raise InputError(f"model {model.name!r} of a pack names array {name!r}, which it does not hold")
-    if model.kind == "forced" and D == 3:
+    if model.kind == "landmarks":
+        _check_landmarks(pack, model)
+    elif pack.dimension == 2:
+        _check_forced(pack, model)
+    else:
         _check_spatial(pack, model)
-        return
-    values = model.options if model.kind == "landmarks" else model.response or {}
+
+
+def _check_mesh(pack: Pack, model: ModelPart, values: Values) -> None:
+    """Refuse a model of another mesh than the pack's."""
+    mesh, D = pack.manifest.mesh, pack.dimension
+    expected: dict[str, Any] = {"shape": mesh.shape, "spacing": mesh.spacing, "origin": mesh.origin}
+    if model.kind == "landmarks":
+        expected["dimension"] = D
     for key, wanted in expected.items():
-        if key == "dimension" and model.kind == "forced":
-            continue
         came = values.get(key)
         if (came[:D] if isinstance(came, list) else came) != wanted:
             raise InputError(
                 f"{key} of model {model.name!r} must be that of the pack's mesh, {wanted}; got {came}"
             )
-    if model.kind == "forced":
-        _check_forced(pack, model)
-        return
+
+
+def _check_landmarks(pack: Pack, model: ModelPart) -> None:
+    _check_mesh(pack, model, model.options)
     if model.response is not None:
         raise InputError(f"model {model.name!r} of a pack has a response, which landmarks have not")
-    if model.kind == "landmarks":
-        allowed = {"clamped_points", "stiffness"}
-        if not set(model.arrays) <= allowed:
-            raise InputError(
-                f"a model of landmarks has arrays {', '.join(sorted(allowed))}; got {', '.join(model.arrays)}"
-            )
+    allowed = {"clamped_points", "stiffness"}
+    if not set(model.arrays) <= allowed:
+        raise InputError(
+            f"a model of landmarks has arrays {', '.join(sorted(allowed))}; got {', '.join(model.arrays)}"
+        )
     if (points := pack.array(model, "clamped_points")) is not None:
-        _typed(pack, model.arrays["clamped_points"], "float64", (len(points), D), "clamped points")
+        role = model.arrays["clamped_points"]
+        _typed(pack, role, "float64", (len(points), pack.dimension), "clamped points")
         if not np.isfinite(points).all():
             raise InputError("clamped points of a pack must be finite")
     if (firm := pack.array(model, "stiffness")) is not None:
-        _typed(pack, model.arrays["stiffness"], "float64", (prod(mesh.shape),), "the stiffness")
+        nodes = prod(pack.manifest.mesh.shape)
+        _typed(pack, model.arrays["stiffness"], "float64", (nodes,), "the stiffness")
         if not (firm > 0).all():
             raise InputError("every stiffness of a pack must be positive (or infinite)")
 
@@ -404,18 +421,14 @@ def _check_model(pack: Pack, model: ModelPart) -> None:
 def _check_forced(pack: Pack, model: ModelPart) -> None:
     from echospline.scenario import ForcedScene  # noqa: PLC0415 - packs without it are read without the numerics
 
-    given = {role: pack.arrays[name] for role, name in model.arrays.items()}
-    for role, array in given.items():
-        if not np.isfinite(array).all():
-            raise InputError(f"{role} of model {model.name!r} of a pack must be finite")
-    law = {name: value for name, value in model.options.items() if not isinstance(value, list)}
-    if len(law) < len(model.options):
-        raise InputError(f"every option of model {model.name!r} of a pack is one number")
-    ForcedScene(law, model.response or {}, given)
+    _check_mesh(pack, model, model.response or {})
+    ForcedScene(_law(model), model.response or {}, _finite_arrays(pack, model))
 
 
 def _check_spatial(pack: Pack, model: ModelPart) -> None:
     """Refuse tables of a forced model in space that do not fit each other or the mesh."""
+    from echospline.scenario import SpatialForcedScene  # noqa: PLC0415 - as above
+
     mesh, response = pack.manifest.mesh, model.response or {}
     corners = {
         "low": mesh.origin,
@@ -425,19 +438,22 @@ def _check_spatial(pack: Pack, model: ModelPart) -> None:
         came = response.get(name)
         if not isinstance(came, list) or len(came) != 3 or not np.allclose(came, wanted, atol=1e-6):
             raise InputError(f"{name} of model {model.name!r} must be that of the mesh, {wanted}; got {came}")
+    SpatialForcedScene(_law(model), response, _finite_arrays(pack, model))
+
+
+def _finite_arrays(pack: Pack, model: ModelPart) -> dict[str, NDArray[Any]]:
     given = {role: pack.arrays[name] for role, name in model.arrays.items()}
-    if set(given) != {"sources", "conditions", "condition_faces", "answers"}:
-        raise InputError(
-            f"a forced model in space has sources, conditions, condition_faces and answers; got {', '.join(given)}"
-        )
-    points = len(given["condition_faces"])
-    sizes = {role: array.size for role, array in given.items()}
-    rows, rest = divmod(sizes["answers"], max(3 * points, 1))
-    if sizes["conditions"] != 3 * points or sizes["sources"] % 3 or rest or rows - sizes["sources"] not in (0, 3, 6):
-        raise InputError(f"the tables of model {model.name!r} of a pack do not fit each other: {sizes}")
     for role, array in given.items():
         if not np.isfinite(array).all():
             raise InputError(f"{role} of model {model.name!r} of a pack must be finite")
+    return given
+
+
+def _law(model: ModelPart) -> dict[str, float]:
+    law = {name: value for name, value in model.options.items() if not isinstance(value, list)}
+    if len(law) < len(model.options):
+        raise InputError(f"every option of model {model.name!r} of a pack is one number")
+    return law
 
 
 def _typed(pack: Pack, name: str, dtype: str, shape: tuple[int, ...], what: str) -> None:

@@ -9,19 +9,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echospline.errors import InputError
-from echospline.mechanics import SpatialForceModel, SpatialLandmarkModel
-from echospline.mechanics.space_response import SpaceResponse
-from echospline.page.pack import FORMAT, Manifest, MeshPart, ModelPart, NeedlePart, Pack, ProbePart, VolumePart, table
+from echospline.page.pack import (
+    FORMAT,
+    Manifest,
+    MeshPart,
+    ModelPart,
+    NeedlePart,
+    Pack,
+    ProbePart,
+    VolumePart,
+    table,
+)
 from echospline.page.packing import FASTEST, LABELS, LAG, SENTENCES
 from echospline.picture import NeedleEcho
-from echospline.scenario.space_models import build_spatial_model
-from echospline.scenario.space_scene import SpatialScene
+from echospline.scenario import CoreScene, SpatialScene, spatial_scene
 from echospline.scene import ImagingPlane, SpatialGrid
 
-LAW = (
-    "tip", "friction_limit", "bond", "tip_stiffness", "side_stiffness", "viscosity", "station_spacing", "substep", "dead_band",
-)  # fmt: skip
-"""Numbers of the law, as the core names them."""
 NARROW = {"condition_faces": np.int32, "answers": np.float32}
 """Types of tables in a pack: single precision moves the answer by 2e-6 mm in `sample:spine`, and halves the file."""
 MOST_VOXELS = 40_000_000
@@ -55,7 +58,11 @@ def packed_space(scene: SpatialScene, *, language: str = "en", rate: float = 120
         )
     grid, insertion, shape = space.grid(volume), space.needle.insertion(), space.probe.probe()
     pose = insertion.pose(float(insertion.times[0]))
-    axis = np.subtract(insertion.tip[-1], insertion.entry[-1]) if space.needle.path else np.array(space.needle.direction)
+    axis = (
+        np.subtract(insertion.tip[-1], insertion.entry[-1])
+        if space.needle.path
+        else np.array(space.needle.direction)
+    )
     axis = axis / np.linalg.norm(axis)
     plane = space.probe.planes(insertion).at(float(insertion.times[0]))
     arrays: dict[str, NDArray[Any]] = {"voxels": np.ascontiguousarray(volume.voxels)}
@@ -98,25 +105,21 @@ def _models(scene: SpatialScene, grid: SpatialGrid, arrays: dict[str, NDArray[An
     scenario, parts = scene.scenario, []
     for kind in sorted(("green", "elastic"), key=lambda kind: kind != scenario.model.kind):
         try:
-            model = build_spatial_model(scenario, grid, scene.tissue, kind=kind)
+            core = spatial_scene(scenario, grid, scene.tissue, kind)
         except InputError:
             if kind == scenario.model.kind:
                 raise
             continue  # a second model is offered where this volume is not too large for it
+        if core is None:
+            continue  # finite elements answer for tissue with regions: nothing that a page has
         given: dict[str, Any]
-        if isinstance(model, SpatialForceModel):
-            if not isinstance(model.response, SpaceResponse):
-                continue  # finite elements answer for tissue with regions: nothing that a page has
-            tables = {name: np.asarray(value) for name, value in model.response.tables().items()}
-            given = {name: value for name, value in tables.items() if value.size > 3}
-            response = {name: value.tolist() for name, value in tables.items() if value.size <= 3}
-            more = {"kind": "forced", "options": {n: getattr(model.law, n) for n in LAW}, "response": response}
-        else:
-            assert isinstance(model, SpatialLandmarkModel)
-            scene_ = model.native.scene
-            given = {"clamped_points": scene_.clamped_points, "stiffness": scene_.stiffness}
-            options = {n: list(v) if isinstance(v, tuple) else v for n, v in scene_.options.items()}
+        if isinstance(core, CoreScene):
+            given = {"clamped_points": core.clamped_points, "stiffness": core.stiffness}
+            options = {n: list(v) if isinstance(v, tuple) else v for n, v in core.options.items()}
             more = {"kind": "landmarks", "options": options}
+        else:
+            given = dict(core.arrays)
+            more = {"kind": "forced", "options": dict(core.options), "response": dict(core.response)}
         named = {}
         for role, array in given.items():
             if array is not None and array.size:

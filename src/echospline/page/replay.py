@@ -30,7 +30,7 @@ class Tissue(Protocol):
         """State of tissue that no needle has touched."""
         ...
 
-    def advance(self, state: Any, pose: NeedlePose, dt: float) -> Any:
+    def advance(self, state: Any, pose: Any, dt: float) -> Any:
         """State after the needle has moved to ``pose`` in ``dt`` seconds."""
         ...
 
@@ -97,17 +97,25 @@ def tissue_of(pack: Pack, model: ModelPart) -> Tissue:
     from echospline.scenario import (  # noqa: PLC0415 - packs are read without the numerics
         CoreScene,
         ForcedScene,
+        SpatialForcedScene,
         forced_steps,
         landmark_steps,
+        spatial_steps,
     )
 
-    if model.kind == "forced":
-        law = {name: float(value) for name, value in model.options.items() if not isinstance(value, list)}
-        given = {role: pack.arrays[name] for role, name in model.arrays.items()}
-        return forced_steps(ForcedScene(law, model.response or {}, given))
-    points = pack.array(model, "clamped_points")
-    clamped = np.empty((0, pack.dimension)) if points is None else np.ascontiguousarray(points)
-    return landmark_steps(CoreScene(model.options, clamped, pack.array(model, "stiffness")))
+    tissue: Tissue
+    if model.kind == "landmarks":
+        points = pack.array(model, "clamped_points")
+        clamped = np.empty((0, pack.dimension)) if points is None else np.ascontiguousarray(points)
+        tissue = landmark_steps(CoreScene(model.options, clamped, pack.array(model, "stiffness")))
+        return tissue
+    law = {name: float(value) for name, value in model.options.items() if not isinstance(value, list)}
+    given = {role: pack.arrays[name] for role, name in model.arrays.items()}
+    if pack.dimension == 3:
+        tissue = spatial_steps(SpatialForcedScene(law, model.response or {}, given))
+    else:
+        tissue = forced_steps(ForcedScene(law, model.response or {}, given))
+    return tissue
 
 
 def replay(pack: Pack, session: RecordedSession) -> Trace:

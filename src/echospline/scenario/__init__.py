@@ -9,10 +9,13 @@ if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.scenario.core_models import (
         CoreScene,
         ForcedScene,
+        SpatialForcedScene,
         forced_scene,
         forced_steps,
         landmark_scene,
         landmark_steps,
+        spatial_scene,
+        spatial_steps,
     )
     from echospline.scenario.models import MODELS, build_model
     from echospline.scenario.run import run
@@ -25,7 +28,7 @@ if TYPE_CHECKING:  # the menu, loaded on demand
     )
     from echospline.scenario.scenario import LARGEST_FILE, Scenario, describe, load, validated
     from echospline.scenario.sections import DiscSection, ExerciseSection
-    from echospline.scenario.space_scene import is_spatial, open_spatial
+    from echospline.scenario.space_scene import SpatialScene, is_spatial, open_spatial
 else:
     on_demand(__name__)
 
@@ -39,6 +42,8 @@ __all__ = [
     "ExerciseSection",
     "ForcedScene",
     "Scenario",
+    "SpatialForcedScene",
+    "SpatialScene",
     "bodies_of",
     "build_model",
     "check",
@@ -54,5 +59,7 @@ __all__ = [
     "open_spatial",
     "run",
     "size_doubts",
+    "spatial_scene",
+    "spatial_steps",
     "validated",
 ]

@@ -12,13 +12,29 @@ from echospline.mechanics import (
     GreenModel,
     NativeStep,
     NeedleForces,
+    SpatialForcedScene,
+    SpatialForceModel,
+    SpatialLandmarkModel,
+    SpatialStep,
     TPSModel,
 )
+from echospline.mechanics.space_response import SpaceResponse
 from echospline.scenario.models import build_model
 from echospline.scenario.scenario import Scenario
-from echospline.scene import RegularGrid
+from echospline.scenario.space_models import build_spatial_model
+from echospline.scene import RegularGrid, SpatialGrid, Tissue
 
-__all__ = ["CoreScene", "ForcedScene", "forced_scene", "forced_steps", "landmark_scene", "landmark_steps"]
+__all__ = [
+    "CoreScene",
+    "ForcedScene",
+    "SpatialForcedScene",
+    "forced_scene",
+    "forced_steps",
+    "landmark_scene",
+    "landmark_steps",
+    "spatial_scene",
+    "spatial_steps",
+]
 
 LANDMARKS = ("tps", "elastic")
 """Models of landmarks."""
@@ -94,3 +110,44 @@ def forced_steps(scene: ForcedScene) -> ForcedStep:
         If the core refuses it.
     """
     return ForcedStep(scene)
+
+
+def spatial_scene(
+    scenario: Scenario, grid: SpatialGrid, tissue: Tissue, kind: str
+) -> CoreScene | SpatialForcedScene | None:
+    """Return what the core is given for a model in space; None where finite elements answer, which it has not.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Its [space.mesh] and [model].
+    grid : SpatialGrid
+        The mesh.
+    tissue : Tissue
+        In space.
+    kind : {"green", "tps", "elastic"}
+        The model.
+
+    Raises
+    ------
+    InputError
+        If its parameters are invalid, or the mesh is too large for it.
+    """
+    model = build_spatial_model(scenario, grid, tissue, kind=kind)
+    if isinstance(model, SpatialLandmarkModel):
+        return model.native.scene
+    assert isinstance(model, SpatialForceModel)
+    if not isinstance(model.response, SpaceResponse):
+        return None
+    return SpatialForcedScene.of(model.response, model.law)
+
+
+def spatial_steps(scene: SpatialForcedScene) -> SpatialStep:
+    """Return the native core's steps of a forced scene in space.
+
+    Raises
+    ------
+    InputError, SolverError
+        If the core refuses it.
+    """
+    return SpatialStep(scene)

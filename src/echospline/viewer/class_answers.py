@@ -28,7 +28,7 @@ _PRIVATE = ("owner", "source", "picture", "upload", "events")
 
 
 def own_answer(sessions: Sequence[Session], owner: str, trainee: str, criterion: Criterion) -> dict[str, Any]:
-    """Return what a trainee sees: the sessions of that name that the same browser sent, their curves, and experts without a name.
+    """Return what a trainee sees: the sessions of that name that the same browser sent, their curves, and experts and their level without a name.
 
     Parameters
     ----------
@@ -46,7 +46,10 @@ def own_answer(sessions: Sequence[Session], owner: str, trainee: str, criterion:
             {**_listed(s), "trainee": ""} for s in sessions if s.expert
         ],
         "criterion": criterion.to_dict(),
-        "curves": [_curves(group, criterion, group_too=False) for group in _groups(own)],
+        "curves": [
+            _curves(group, criterion, group_too=False)
+            for group in _groups([s for s in sessions if s.expert or s in own])
+        ],
     }  # fmt: skip
 
 
@@ -182,14 +185,14 @@ def _curves(sessions: Sequence[Session], criterion: Criterion, *, group_too: boo
     answer: dict[str, Any] = {
         "scene": sessions[0].scene, "exercise": sessions[0].exercise, "trainees": curves,
     }  # fmt: skip
+    experts = [s for s in sessions if s.expert and s.counts]
+    answer["expert"] = {"sessions": [s.id for s in experts], "metrics": _level(experts)}
     if group_too:
         middle, counts = group_median([one["values"] for one in curves])
         answer["median"] = {
             "trainees": counts, "values": middle,
             "metrics": {name: group_median([one["metrics"][name] for one in curves])[0] for name in METRICS},
         }  # fmt: skip
-        experts = [s for s in sessions if s.expert and s.counts]
-        answer["expert"] = {"sessions": [s.id for s in experts], "metrics": _level(experts)}
     return answer
 
 

@@ -24,7 +24,9 @@ class Head(BaseModel):
     rows: Side
     frames: int = Field(ge=1, le=100_000)
     samples: int = Field(1, ge=1, le=3)
-    spacing: tuple[Annotated[float, Field(gt=0, le=1000)], Annotated[float, Field(gt=0, le=1000)]] | None = None
+    spacing: tuple[Annotated[float, Field(gt=0, le=1000)], Annotated[float, Field(gt=0, le=1000)]] | None = (
+        None
+    )
     title: str = Field("", max_length=200)
 
 
@@ -50,7 +52,7 @@ def as_dicom(data: bytes, rate: str) -> bytes:
         head = Head.model_validate(json.loads(line))
     except (ValueError, RecursionError, ValidationError):
         raise InputError(
-            'expected a line of JSON with columns, rows, frames and spacing, then the frames'
+            "expected a line of JSON with columns, rows, frames and spacing, then the frames"
         ) from None
     if head.samples == 2:
         raise InputError("frames are grey (1 sample) or red, green and blue (3); got 2")

@@ -1,4 +1,4 @@
-// What an instructor looks at: the answer of the server about a class, checked, and the tables and charts that follow from it. Pure.
+// What an instructor sees of a class, and a trainee of the own sessions: the server's answer, checked, and the tables and charts that follow. Pure.
 
 import { LINES } from "./chart.js";
 import { PackError, asList, asNumber, asRecord, asText, asWhole } from "./checked.js";
@@ -27,11 +27,11 @@ const MOST_CLASS_SESSIONS = 1_000_000, MOST_CLASS_TRAINEES = 10_000;
 /** What a chart can show over the attempts: the curve of LC-CUSUM, and metrics with their units. */
 export const CLASS_CHARTS = /** @type {[string, string][]} */ ([["cusum", ""], ["final_error", "mm"], ["time", "s"], ["path_length", "mm"], ["tissue_damage", "mm²"], ["redirections", ""], ["vessel_contacts", ""]]);
 
-/** Read what the server says of a class. @param {unknown} value @returns {ClassAnswer} */
+/** Read what the server says of a class, or to a trainee, who gets no median of others and experts apart. @param {unknown} value @returns {ClassAnswer} */
 export function readClass(value) {
   const given = asRecord(value, "the class"), criterion = asRecord(given.criterion, "criterion");
   return {
-    sessions: asList(given.sessions, "sessions", 0, MOST_CLASS_SESSIONS).map((entry, k) => readClassSession(asRecord(entry, `sessions[${k}]`), `sessions[${k}]`)),
+    sessions: [...asList(given.sessions, "sessions", 0, MOST_CLASS_SESSIONS), ...asList(given.experts ?? [], "experts", 0, MOST_CLASS_SESSIONS)].map((entry, k) => readClassSession(asRecord(entry, `sessions[${k}]`), `sessions[${k}]`)),
     threshold: asNumber(criterion.threshold, "criterion.threshold", 0), unacceptable: asNumber(criterion.unacceptable, "criterion.unacceptable", 0, 1),
     attempts: asWhole(criterion.attempts, "criterion.attempts", 1, 1e6), risk: asNumber(criterion.risk, "criterion.risk", 0, 1),
     groups: asList(given.curves, "curves", 0, MOST_CLASS_SESSIONS).map((entry, k) => readClassGroup(asRecord(entry, `curves[${k}]`), `curves[${k}]`)),
@@ -52,7 +52,7 @@ function readClassSession(s, what) {
 
 /** @param {Record<string, any>} g @param {string} what @returns {ClassGroup} */
 function readClassGroup(g, what) {
-  const median = asRecord(g.median, `${what}.median`), expert = asRecord(g.expert, `${what}.expert`);
+  const median = asRecord(g.median ?? { trainees: [], values: [], metrics: {} }, `${what}.median`), expert = asRecord(g.expert, `${what}.expert`);
   return {
     scene: asText(g.scene, `${what}.scene`, 2000), exercise: asText(g.exercise, `${what}.exercise`, 2000),
     trainees: asList(g.trainees, `${what}.trainees`, 0, MOST_CLASS_TRAINEES).map((entry, k) => readTraineeCurve(asRecord(entry, `${what}.trainees[${k}]`), `${what}.trainees[${k}]`)),
@@ -114,7 +114,7 @@ export function classChart(answer, group, shown, trainee, say, theme) {
   const level = cusum ? answer.threshold : group.expert.metrics[shown];
   return {
     lines: [
-      ...others.filter(({ x }) => x.length), line(say("class-median"), colours.two, rowOf(group.median)),
+      ...others.filter(({ x }) => x.length), ...(group.median.values.length ? [line(say("class-median"), colours.two, rowOf(group.median))] : []),
       ...(chosen ? [line(chosen.trainee || say("nobody"), colours.one, rowOf(chosen), true)] : []),
     ],
     xLabel: say("plot-attempt"), yLabel: CLASS_CHARTS.find(([name]) => name === shown)?.[1] ?? "", counted: true,
@@ -143,7 +143,7 @@ export function classSessions(answer, group, trainee) {
 export function classCells(s, say, language) {
   const at = new Date(s.started), ended = s.ended === "finished" ? "" : ` · ${say(s.ended === "reset" ? "ended-reset" : "ended-time")}`;
   return [
-    String(s.id), Number.isNaN(at.getTime()) ? s.started : at.toLocaleString(language, { dateStyle: "short", timeStyle: "short" }), s.trainee || say("nobody"), s.exercise, String(s.attempt),
+    String(s.id), Number.isNaN(at.getTime()) ? s.started : at.toLocaleString(language, { dateStyle: "short", timeStyle: "short" }), s.trainee || say(s.expert ? "expert" : "nobody"), String(s.attempt),
     say(s.passed ? "passed" : "failed") + ended, s.error === null ? "–" : `${printed(s.error)} mm`, `${printed(s.time)} s`,
     s.verified === null ? "–" : s.verified ? say("class-verified") : `${say("class-differs")}: ${s.difference}`,
   ];

@@ -1,4 +1,4 @@
-// The instructor's view of a class: a dialog of its own, filled from the server. It draws what class.js says.
+// The instructor's view of a class, and a trainee's of the own sessions: a dialog filled from the server. It draws what class.js says.
 
 import { download } from "./capture.js";
 import { drawChart } from "./chart.js";
@@ -30,6 +30,8 @@ export class ClassView {
     this.shown = "cusum";
     /** @type {string | null} all where null */
     this.trainee = null;
+    /** Name of the trainee who looks; null for the instructor. @type {string | null} */
+    this.own = null;
     this.dialog = /** @type {HTMLDialogElement} */ (element("dialog", { id: "class", className: "class" }));
     this.dialog.setAttribute("aria-labelledby", "class-title");
     this.dialog.addEventListener("click", (event) => event.target === this.dialog && this.dialog.close());
@@ -37,8 +39,9 @@ export class ClassView {
     this.said.setAttribute("role", "alert");
   }
 
-  /** Read the class anew and show it. */
-  async open() {
+  /** Read the class, or the sessions of a trainee, anew and show them. @param {string | null} [own] */
+  async open(own = null) {
+    this.own = this.trainee = own;
     if (!this.dialog.isConnected) document.body.append(this.dialog);
     await this.read();
     if (!this.dialog.open) this.dialog.showModal();
@@ -48,7 +51,7 @@ export class ClassView {
   async read() {
     put(this.said, "");
     try {
-      const answer = await this.page.ask("api/class");
+      const answer = await this.page.ask(this.own === null ? "api/class" : `api/sessions?${new URLSearchParams({ trainee: this.own })}`);
       if (!answer.ok) throw new Error(await answer.text());
       this.answer = readClass(await answer.json());
     } catch (error) {
@@ -78,11 +81,11 @@ export class ClassView {
     const choices = element("div", { className: "row" },
       this.select(say("exercise"), (answer?.groups ?? []).map((one, k) => [String(k), several(answer, one.exercise) ? `${one.exercise} · ${one.scene}` : one.exercise]), String(this.chosen), (value) => {
         this.chosen = Number(value);
-        this.trainee = null;
+        this.trainee = this.own;
       }),
-      this.select(say("trainee"), [["*", say("everybody")], ...(answer ? traineesOf(answer, group) : []).map((name) => /** @type {[string, string]} */ ([`=${name}`, name || say("nobody")]))], this.trainee === null ? "*" : `=${this.trainee}`, (value) => {
+      ...(this.own !== null ? [] : [this.select(say("trainee"), [["*", say("everybody")], ...(answer ? traineesOf(answer, group) : []).map((name) => /** @type {[string, string]} */ ([`=${name}`, name || say("nobody")]))], this.trainee === null ? "*" : `=${this.trainee}`, (value) => {
         this.trainee = value === "*" ? null : value.slice(1);
-      }),
+      })]),
       this.select(say("class-shown"), CLASS_CHARTS.map(([name]) => [name, say(name)]), this.shown, (value) => {
         this.shown = value;
       }),
@@ -90,13 +93,13 @@ export class ClassView {
     const meaning = answer ? say("class-meaning", { threshold: answer.threshold.toFixed(2), risk: Math.round(100 * answer.risk), rate: Math.round(100 * answer.unacceptable), attempts: answer.attempts }) : "";
     const empty = !answer?.sessions.length;
     this.dialog.replaceChildren(
-      element("h2", { id: "class-title", textContent: say("class-title") }), this.said,
+      element("h2", { id: "class-title", textContent: say(this.own === null ? "class-title" : "own-title") }), this.said,
       ...(empty ? [element("p", { textContent: answer ? say("no-sessions") : "" })] : [
         choices, this.canvas, element("p", { className: "count", textContent: meaning }),
         ...(group ? [this.table(["trainee", "class-attempts", "class-passed", "cusum", "class-proficient"], standings(group, say).map(({ cells }) => element("tr", {}, ...cells.map((text) => element("td", { textContent: text })))))] : []),
         this.list(),
       ]),
-      element("div", { className: "row" }, this.csv("api/class.csv", "echospline-sessions.csv", say("class-csv")), this.csv("api/class/curves.csv", "echospline-curves.csv", say("class-curves-csv")), again, element("span", { className: "spring" }), close),
+      element("div", { className: "row" }, ...(this.own !== null ? [] : [this.csv("api/class.csv", "echospline-sessions.csv", say("class-csv")), this.csv("api/class/curves.csv", "echospline-curves.csv", say("class-curves-csv"))]), again, element("span", { className: "spring" }), close),
     );
     this.chart();
   }
@@ -112,7 +115,7 @@ export class ClassView {
 
   list() {
     const answer = /** @type {ClassAnswer} */ (this.answer), { language } = this.page.look(), say = this.say;
-    const rows = classSessions(answer, this.group, this.trainee).slice(0, MOST_CLASS_ROWS).map((session) => {
+    const rows = classSessions(answer, this.group, this.own === null ? this.trainee : null).slice(0, MOST_CLASS_ROWS).map((session) => {
       const replay = element("button", { type: "button", textContent: say("replay") });
       replay.addEventListener("click", () => void this.fetched(session.id, (whole) => {
         this.dialog.close();
@@ -123,9 +126,9 @@ export class ClassView {
       const level = element("button", { type: "button", textContent: say("class-benchmark"), title: say("class-benchmark-title") });
       level.setAttribute("aria-pressed", String(session.expert));
       level.addEventListener("click", () => void this.mark(session.id, !session.expert));
-      return element("tr", {}, ...classCells(session, say, language).map((text) => element("td", { textContent: text })), element("td", {}, replay, beside, level));
+      return element("tr", {}, ...classCells(session, say, language).map((text) => element("td", { textContent: text })), element("td", {}, replay, beside, ...(this.own === null ? [level] : [])));
     });
-    return this.table(["number", "started", "trainee", "exercise", "class-attempt", "result", "final_error", "time", "class-check", ""], rows);
+    return this.table(["number", "started", "trainee", "class-attempt", "result", "final_error", "time", "class-check", ""], rows);
   }
 
   /** @param {string[]} heads words, or nothing @param {Node[]} rows */

@@ -372,6 +372,7 @@ const COMMANDS = {
   phone: () => served?.phone(),
   open: () => void openDialog("open"),
   class: () => void served?.class.open(),
+  own: () => void served?.class.open(inputOf("trainee").value.trim()),
 };
 
 /** @param {string} name */

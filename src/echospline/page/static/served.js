@@ -59,7 +59,7 @@ export class Served {
     this.offer = await this.server.hello();
     this.tracker = this.offer.tracker;
     const space = this.page.state().held !== null;
-    const has = { uploads: this.offer.uploads, fem: this.offer.fem && !space, class: this.offer.instructor, dicom: true, phone: space };
+    const has = { uploads: this.offer.uploads, fem: this.offer.fem && !space, class: this.offer.instructor, own: !this.offer.instructor, dicom: true, phone: space };
     for (const place of document.querySelectorAll("[data-served]")) /** @type {HTMLElement} */ (place).hidden = !has[/** @type {"fem"} */ (/** @type {HTMLElement} */ (place).dataset.served)];
     this.tell();
   }

@@ -81,6 +81,7 @@ const TABLE = {
   "attempts-shown": ["{passed} of {count} passed", "{passed} von {count} bestanden"],
   // the class
   "class": ["Class", "Klasse"], "class-open-title": ["Sessions and learning curves of the class", "Versuche und Lernkurven der Klasse"], "class-title": ["The class", "Die Klasse"], "nobody": ["no name", "ohne Name"],
+  "own": ["Curve", "Kurve"], "own-open-title": ["My sessions on the server, my learning curve, and experts", "Meine Versuche auf dem Server, meine Lernkurve, und Vorbilder"], "own-title": ["My sessions on the server", "Meine Versuche auf dem Server"],
   "class-median": ["median of the class", "Median der Klasse"], "class-threshold": ["proficient", "sicher"], "cusum": ["LC-CUSUM", "LC-CUSUM"], "class-shown": ["Curve", "Kurve"], "class-plot": ["Curves over attempts", "Kurven über die Versuche"],
   "class-meaning": ["Every attempt that is verified counts, also one given up by Reset. Proficient is who reaches {threshold}: one who fails {rate} % of the attempts does so within {attempts} with a probability of at most {risk} %.", "Jeder geprüfte Versuch zählt, auch ein durch Zurück aufgegebener. Sicher ist, wer {threshold} erreicht: wer {rate} % der Versuche nicht besteht, erreicht das in {attempts} mit höchstens {risk} % Wahrscheinlichkeit."],
   "class-attempts": ["Attempts", "Versuche"], "class-attempt": ["Attempt", "Versuch"], "class-passed": ["Passed", "Bestanden"], "class-proficient": ["Proficient", "Sicher"], "class-not-yet": ["not yet", "noch nicht"], "class-since": ["since attempt {attempt}", "seit Versuch {attempt}"],
