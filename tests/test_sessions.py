@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import shutil
 import sqlite3
@@ -392,3 +393,20 @@ def test_a_deleted_trainee_is_not_left_in_the_file(tmp_path, rows):
     with sqlite3.connect(sessions.path) as database:
         database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
     assert b"Rumpelstiltskin" not in sessions.path.read_bytes()
+
+
+def test_where_a_probe_was_comes_back_as_it_was(tmp_path, pack, rows):
+    sessions = Sessions(tmp_path / "kept.sqlite")
+    planes = base64.b64encode(np.array([[0.0, 1, 2, 3, 4, 5, 6], [9, 1, 2, 3, 4, 5, 7]]).tobytes()).decode()
+    trace = trace_of(rows)
+    for told in (planes, ""):
+        sessions.add(
+            EXERCISE, trace, score(trace, EXERCISE), trainee="Ann", scene="S", model="tps",
+            record=Record(planes=told, version="0.1.0", core="c" * 64, pack=pack.digest),
+        )  # fmt: skip
+    found = parsed_sessions(
+        sessions_file([session_file(*sessions.load(n)) for n in (1, 2)]).encode(), "export"
+    )
+    assert [session.planes for session in found] == [planes, None]
+    assert found[0].plane_rows()[1].tolist() == [9, 1, 2, 3, 4, 5, 7]
+    assert "planes" not in sessions.find(1).to_dict()

@@ -66,6 +66,14 @@ test("an examination draws no ring, no guide, no number: the same as if there we
   assert.ok(texts(list).includes("0:02"), "but time is shown");
 });
 
+test("a target that no picture shows is seen in an examination until the needle is in, an imaged one never", () => {
+  const examined = after(freshState(), { do: "examination" }, { do: "start", lot: 0 }), out = live({ tip: [8, 0] });
+  assert.equal(circles(drawList(examined, out, say), "#ffd166").length, 1);
+  assert.equal(circles(drawList(examined, out, say), "#ff7b7b").length, 0);
+  examined.run.exercise = { ...examined.run.exercise, target: { ...examined.run.exercise.target, imaged: true } };
+  assert.equal(circles(drawList(examined, out, say), "#ffd166").length, 0);
+});
+
 test("helps are drawn or not, one by one", () => {
   const of = (name) => drawList(after(freshState(), { do: "help", name }), live(), say);
   assert.equal(circles(of("rings"), "#ffd166").length, 0);

@@ -100,7 +100,7 @@ def session_file(session: Session, exercise: Exercise, trace: Trace, *, named: b
         "examination": session.examination, "trainee": session.trainee if named else "",
         "attempt": session.attempt if session.told is None else session.told,
         "started": session.started, "rate": _rate(trace), "ended": session.ended, "steps": len(trace),
-        "poses": base64.b64encode(trace.poses.astype("<f8").tobytes()).decode("ascii"), "planes": None, "events": session.events,
+        "poses": base64.b64encode(trace.poses.astype("<f8").tobytes()).decode("ascii"), "planes": session.planes or None, "events": session.events,
         "score": session.score,
     }  # fmt: skip
 

@@ -34,6 +34,7 @@ CREATE TABLE session (
   examination INTEGER NOT NULL DEFAULT 0,
   ended TEXT NOT NULL DEFAULT 'finished', -- finished, reset or time
   events TEXT NOT NULL DEFAULT '[]',      -- JSON: [[step, kind], ...]
+  planes TEXT NOT NULL DEFAULT '', -- base64, as a page exports them: where a probe was that moved; empty in the plane
   version TEXT NOT NULL DEFAULT '', -- of echospline, whose page recorded it
   core TEXT NOT NULL DEFAULT '',    -- SHA-256 of the WebAssembly
   pack TEXT NOT NULL DEFAULT '',    -- SHA-256 of the scene's bytes

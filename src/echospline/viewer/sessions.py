@@ -22,7 +22,7 @@ from echospline.viewer.pictures import Pictures
 from echospline.viewer.session_schema import opened, prepare, written
 
 _COLUMNS = (
-    "id, started, trainee, exercise, scene, model, source, score, picture, upload, attempt, told, examination, ended, events, "
+    "id, started, trainee, exercise, scene, model, source, score, picture, upload, attempt, told, examination, ended, events, planes, "
     "version, core, pack, verified, difference, expert, owner"
 )
 
@@ -51,6 +51,8 @@ class Session:
         Whether it was recorded without any help.
     ended : {"finished", "reset", "time"}
     events : list of [step, kind]
+    planes : str
+        Where a probe was that moved, as a page exports it; empty in the plane.
     version, core, pack : str
         What made it: version of echospline, SHA-256 of its core and of the scene.
     verified : bool or None
@@ -78,6 +80,7 @@ class Session:
     examination: bool
     ended: str
     events: list[list[Any]]
+    planes: str
     version: str
     core: str
     pack: str
@@ -97,8 +100,10 @@ class Session:
         return bool(self.score["passed"]) and self.ended != "reset"
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON, without the source and the owner's key."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("source", "owner")}
+        """Return plain values for JSON, without the source, the probe's motion and the owner's key."""
+        return {
+            f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("source", "owner", "planes")
+        }
 
 
 @dataclass(frozen=True)
@@ -115,6 +120,7 @@ class Record:
     ended: str = "finished"
     examination: bool = False
     events: tuple[tuple[int, str], ...] = ()
+    planes: str = ""
     told: int | None = None
     version: str = ""
     core: str = ""
@@ -216,7 +222,7 @@ class Sessions:
         """
         session = found.session
         record = Record(
-            session.when, session.ended, session.examination, tuple(session.events), session.attempt, session.version,
+            session.when, session.ended, session.examination, tuple(session.events), session.planes or "", session.attempt, session.version,
             session.core, session.scene.pack, not found.differences, "; ".join(found.differences), session.digest, owner,
         )  # fmt: skip
         person = (session.trainee, scene or session.scene.title, session.model, source, "", upload)
@@ -253,7 +259,7 @@ class Sessions:
             "trainee": trainee, "exercise": exercise.name, "definition": exercise.model_dump_json(), "scene": scene,
             "source": source, "model": model, "score": json.dumps(score.to_dict()), "trace": trace.to_bytes(), "picture": picture,
             "upload": upload, "attempt": attempt, "told": record.told, "examination": int(record.examination), "ended": record.ended,
-            "events": json.dumps(record.events), "version": record.version, "core": record.core, "pack": record.pack,
+            "events": json.dumps(record.events), "planes": record.planes, "version": record.version, "core": record.core, "pack": record.pack,
             "verified": None if record.verified is None else int(record.verified), "difference": record.difference,
             "digest": record.digest, "owner": record.owner,
         }  # fmt: skip

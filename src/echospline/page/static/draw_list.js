@@ -33,6 +33,7 @@ const INK = "#e8f1f5", QUIET = "#a9bac5", ACCENT = "#5fd4e0", TARGET = "#ffd166"
 const STAGES = { dark: { back: "#05070a", quiet: "#a9bac5", rule: "#5b6b77", from: "#27323b", to: "#4a5a66" }, light: { back: "#dfe6ea", quiet: "#45545e", rule: "#7b8b96", from: "#8b9aa5", to: "#5b6b77" } };
 const OUTSIDE = 34; // mm of shaft that is drawn above the skin
 const HUB_ROOM = 14; // CSS pixels between its end and the top of the stage
+const PLATE = "rgba(5, 8, 10, 0.5)";
 const SLICE = 2.5; // mm off the plane up to which a needle is drawn as lying in it
 const FAR = 400; // mm that the guide reaches
 const LOW_TIME = 10; // s left at which the countdown is coloured
@@ -49,7 +50,7 @@ export function drawList(state, live, say) {
     ...ruler(view, state, stage),
     ...probe(view, state, stage),
     { draw: "clip", area: view.area },
-    ...(helps.rings && exercise ? rings(view, shown, exercise, say) : []),
+    ...(exercise && (helps.rings || unseen(state, shown)) ? rings(view, shown, helps.rings ? exercise : { ...exercise, vessels: [] }, say) : []),
     ...(helps.guide ? guide(view, shown) : []),
     ...(live.expert ? expertNeedle(view, plane, live.expert, say) : []),
     ...calipers(view, state),
@@ -113,6 +114,11 @@ function probe(view, { probe: shape }, stage) {
     { draw: "bar", area: { left, top: y - 15, right, bottom: y - 2 }, from: stage.from, to: stage.to, round: 6 },
     { draw: "circle", at: [dot, y - 8.5], r: 3.5, ink: ACCENT, width: 0, fill: ACCENT },
   ];
+}
+
+/** Whether a target that no picture shows has to be shown, or nobody could aim: without help, until the needle is in the tissue. @param {State} state @param {Seen} seen */
+function unseen({ run }, { inside }) {
+  return run !== null && !inside && !run.exercise.target.imaged && !run.exercise.target.echo;
 }
 
 /** Target and vessels where the plane cuts them. @param {View} view @param {Seen} seen @param {Exercise} exercise @param {Say} say @returns {DrawCommand[]} */
@@ -218,13 +224,22 @@ function readouts(view, state, live, seen, shown, toTarget, say) {
     line(clock(left), left <= LOW_TIME ? VESSEL : INK, 22, true);
   }
   if (state.frozen) line(say(state.comparing ? "fem-shown" : "frozen"), TARGET, 13, true);
-  if (!shown) return drawn;
+  if (!shown) return behind(drawn);
   const D = state.low.length, depth = Math.hypot(...state.low.map((_, d) => live.tip[d] - live.entry[d]));
   line(`${say("depth-short")} ${depth.toFixed(1)} mm`, INK, 13);
   line(`${state.needle.angle.toFixed(0)}°  ${(Math.abs(live.speed) < 0.05 ? 0 : live.speed).toFixed(0)} mm/s`, QUIET, 13);
   if (toTarget && live.watched.length >= D) line(`${say("to-target")} ${Math.hypot(...state.low.map((_, d) => live.tip[d] - live.watched[d])).toFixed(1)} mm`, TARGET, 13);
   if (state.held && seen.inside) line(`${say("off-plane")} ${Math.abs(seen.tip[2]).toFixed(1)} mm`, Math.abs(seen.tip[2]) > SLICE ? VESSEL : QUIET, 13);
-  return drawn;
+  return behind(drawn);
+}
+
+/** Lines of text with a dark plate behind them, or they are lost on bright tissue. @param {DrawCommand[]} lines right-aligned @returns {DrawCommand[]} */
+function behind(lines) {
+  const texts = lines.flatMap((command) => (command.draw === "text" ? [command] : []));
+  if (!texts.length) return lines;
+  const wide = Math.max(...texts.map(({ text, size = 12, bold }) => text.length * size * (bold ? 0.62 : 0.56))), [right] = texts[0].at, sizes = texts.map(({ size = 12 }) => size);
+  const area = { left: right - wide - 8, top: texts[0].at[1] - sizes[0] * 0.8, right: right + 7, bottom: texts[texts.length - 1].at[1] + 12 };
+  return [{ draw: "bar", area, from: PLATE, to: PLATE, round: 6 }, ...lines];
 }
 
 /** How the picture is shown, at its lower left, as on a scanner. @param {View} view @param {State} state @param {Say} say @returns {DrawCommand[]} */

@@ -432,7 +432,7 @@ function wire() {
     if (event.detail > 0 && control && !control.closest("dialog") && !document.querySelector("dialog[open]")) byId("stage").focus({ preventScroll: true });
   });
   setInterval(() => panels.spoken(state, live), 500);
-  if (matchMedia("(max-width: 640px)").matches) for (const panel of document.querySelectorAll("details.panel")) /** @type {HTMLDetailsElement} */ (panel).open = false;
+  if (matchMedia("(max-width: 640px)").matches) for (const panel of document.querySelectorAll("details.panel:not(#probe-panel)")) /** @type {HTMLDetailsElement} */ (panel).open = false;
 }
 
 /** @param {string} text */

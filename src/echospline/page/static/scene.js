@@ -11,7 +11,7 @@ const LONGEST_MANIFEST = 4 << 20; // bytes
 const ARRAY_TYPES = { uint8: Uint8Array, float32: Float32Array, float64: Float64Array, int32: Int32Array, int64: BigInt64Array };
 
 /** @typedef {[number, number]} Point (x lateral, y depth), mm */
-/** @typedef {{ centre: number[], radius: number }} Ball round structure, a disc in the plane; mm */
+/** @typedef {{ centre: number[], radius: number, [extra: string]: any }} Ball round structure, a disc in the plane; mm */
 /**
  * `help` false takes rings, guide and readouts away; `entry` is where the needle enters, `entry_between` where it is drawn by lot (mm); `attempts` a trainee has.
  * @typedef {{

@@ -5,7 +5,7 @@ const TABLE = {
   // picture
   "stage": ["Ultrasound picture with the needle. Arrow keys push, pull and turn it; the question mark shows all keys.", "Ultraschallbild mit der Nadel. Pfeiltasten schieben, ziehen und drehen sie; das Fragezeichen zeigt alle Tasten."],
   "target": ["target", "Ziel"], "vessel": ["vessel", "Gefäß"], "expert": ["expert", "Experte"], "frozen": ["Frozen", "Eingefroren"],
-  "depth-short": ["in", "ein"], "to-target": ["to target", "zum Ziel"], "off-plane": ["tip off the picture by", "Spitze neben dem Bild um"], "gain-short": ["G", "G"], "range-short": ["DR", "DR"], "time-gain-short": ["TGC", "TGC"],
+  "depth-short": ["in", "ein"], "to-target": ["to target", "zum Ziel"], "off-plane": ["beside the picture", "neben dem Bild"], "gain-short": ["G", "G"], "range-short": ["DR", "DR"], "time-gain-short": ["TGC", "TGC"],
   "spoken": ["Needle {depth} mm deep, angle {angle} degrees.", "Nadel {depth} mm tief, Winkel {angle} Grad."],
   "spoken-target": ["Tip {distance} mm from the target.", "Spitze {distance} mm vom Ziel."],
   // hint
@@ -30,7 +30,7 @@ const TABLE = {
   "training": ["Training", "Training"], "exercises": ["Exercises", "Übungen"], "trainee": ["Trainee", "Name"], "optional": ["optional", "freiwillig"],
   "start": ["Start", "Start"], "finish": ["Finish", "Fertig"], "start-title": ["Start or finish (E)", "Beginnen oder beenden (E)"],
   "sessions": ["Attempts", "Versuche"], "sessions-title": ["Attempts kept on this device (L)", "Versuche auf diesem Gerät (L)"],
-  "examination": ["Examination", "Prüfung"], "examination-title": ["No rings, no guide, no numbers; every attempt counts", "Keine Ringe, keine Linie, keine Zahlen; jeder Versuch zählt"],
+  "examination": ["Examination", "Prüfung"], "examination-title": ["No guide, no numbers, no rings once the needle is in; every attempt counts", "Keine Linie, keine Zahlen, keine Ringe, sobald die Nadel drin ist; jeder Versuch zählt"],
   "entry-rule": ["Entry", "Einstich"], "entry-free": ["free", "frei"], "entry-fixed": ["fixed", "fest"], "entry-drawn": ["drawn by lot", "ausgelost"],
   "model": ["Tissue model", "Gewebemodell"], "image": ["Picture", "Bild"], "needle": ["Needle", "Nadel"], "helps": ["Help", "Hilfen"],
   "seen": ["Depth", "Tiefe"], "gain": ["Gain", "Verstärkung"], "range": ["Dynamic range", "Dynamik"], "time-gain": ["Time gain", "Tiefenausgleich"], "time-gain-at": ["Time gain at {mm} mm", "Tiefenausgleich bei {mm} mm"],
@@ -41,7 +41,7 @@ const TABLE = {
   "view-along": ["Along", "Längs"], "view-along-title": ["The picture holds the whole needle (X)", "Das Bild enthält die ganze Nadel (X)"], "view-across": ["Across", "Quer"], "view-across-title": ["The picture cuts the needle at its tip (Z)", "Das Bild schneidet die Nadel an der Spitze (Z)"],
   "entry-z": ["Entry, back", "Einstich, tief"], "heading": ["Heading", "Richtung"], "body": ["Drawing", "Skizze"],
   "key-probe": ["slide the probe; with Shift turn and tilt", "Sonde schieben; mit Umschalt drehen und kippen"], "key-rock": ["rock the probe", "Sonde wippen"], "key-views": ["probe along, across the needle", "Sonde längs, quer zur Nadel"], "key-heading": ["needle's heading, drawing", "Richtung der Nadel, Skizze"],
-  "hint-3-space": ["The other hand: A D W S slide the probe, X and Z look along and across.", "Die andere Hand: A D W S schieben die Sonde, X und Z sehen längs und quer."],
+  "hint-3-space": ["The small drawing moves the probe: drag it.", "Die kleine Skizze bewegt die Sonde: dort ziehen."],
   // messages
   "model-kept": ["The model stays as it is while an attempt is recorded.", "Während ein Versuch läuft, bleibt das Modell."],
   "no-attempts": ["This exercise has {count} attempts, and all of them are made.", "Diese Übung hat {count} Versuche, und alle sind gemacht."],
