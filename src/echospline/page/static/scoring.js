@@ -82,7 +82,7 @@ export function redirectionsOf({ poses, period }, inside) {
     const degrees = ((raw + whole) * 180) / Math.PI, moved = Math.abs(degrees - degreesBefore);
     before = raw;
     degreesBefore = degrees;
-    if (!inside[row] || (row && !inside[row - 1])) {
+    if (!row || !inside[row] || !inside[row - 1]) {
       held = degrees;
       turning = false;
       still = 0;
