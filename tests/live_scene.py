@@ -1,86 +1,47 @@
-"""A small scene with stand-in tissue for the tests of the live page, and a server that runs it."""
+"""A small scene for the tests of the server, and a server that runs it."""
 
 from __future__ import annotations
 
+import http.client
+import json
+import socket
 import threading
+import time
 from contextlib import contextmanager
-from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from urllib.parse import urlsplit
 
-import numpy as np
+from websockets.sync.client import connect
 
-from echospline.scene import RegularGrid, UltrasoundImage
-from echospline.viewer import Disc, Exercise, Scene, Sessions, Settings, build_app, serve
+from echospline.page import parsed_sessions, verify
+from echospline.scenario import build_model
+from echospline.viewer import Scene, Sessions, Settings, build_app, serve
+from page_scene import image, poses, scenario, session, small
 
-IMAGE_GRID = RegularGrid((161, 121), (0.25, 0.25))
-MESH = RegularGrid.covering(IMAGE_GRID, (41, 31))
-
-
-@dataclass(frozen=True)
-class Bump:
-    """Tissue of which a smooth bump is carried along by the tip; far from it nothing moves at all."""
-
-    grid: RegularGrid = MESH
-    share: float = 0.2
-    reach: float = 6.0
-
-    def rest(self):
-        return None
-
-    def advance(self, state, pose, dt):
-        if pose.depth > 30.0:
-            raise RuntimeError("the needle went through the table")
-        return pose
-
-    def displacement(self, state):
-        return self.displacement_at(state, self.grid.nodes)
-
-    def displacement_at(self, state, points):
-        if state is None or state.depth == 0.0:
-            return np.zeros(np.shape(points))
-        d = np.hypot(*(np.asarray(points) - state.tip).T) / self.reach
-        weight = np.where(d < 1, (1 - np.minimum(d, 1) ** 2) ** 2, 0.0)
-        push = self.share * min(state.depth, 10.0)
-        return weight[:, None] * push * np.asarray(state.axis)
+PAGE_KEY = "ab" * 16
 
 
-def speckle():
-    rng = np.random.default_rng(3)
-    noise = rng.normal(size=(123, 163))
-    smooth = sum(np.roll(noise, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1))[1:-1, 1:-1] / 3
-    return np.clip(110 + 45 * smooth, 0, 255).astype(np.uint8)
+@cache
+def pack(title="Speckle"):
+    return small(title=title)
 
 
-EXERCISE = Exercise(
-    name="straight-down",
-    title="Straight down",
-    goal="Push the tip into the ring.",
-    target=Disc(centre=(20.0, 12.0), radius=3.0),
-)
-PAST = Exercise(
-    name="past",
-    title="Past the vessel",
-    target=Disc(centre=(28.0, 18.0), radius=2.0),
-    vessels=[Disc(centre=(20.0, 10.0), radius=2.0)],
-    most_redirections=0,
-)
+def fem():
+    made = scenario()
+    return build_model(made, made.grid(image()), kind="fem", folder=Path())
 
 
-def models(name):
-    return {"soft": Bump(), "stiff": Bump(share=0.1)}[name]
+def scene(title="Speckle", **changes):
+    return Scene(**({"pack": pack(title), "source": "{}", "fem": fem} | changes))
 
 
-def scene(**changes):
-    options = {
-        "title": "Speckle",
-        "image": UltrasoundImage(speckle(), IMAGE_GRID),
-        "grid": MESH,
-        "models": models,
-        "names": (("soft", "Soft"), ("stiff", "Stiff")),
-        "entry": (20.0, 0.0),
-        "angle": 90.0,
-        "exercises": (EXERCISE, PAST),
-    }
-    return Scene(**(options | changes))
+def recorded(of=None, rows=None, **more):
+    """A session of a scene's page, as JSON, with the score that its page computes."""
+    of = of or pack()
+    told = session(of, poses() if rows is None else rows, **more)
+    (given,) = parsed_sessions(json.dumps(told).encode(), "test")
+    return {**told, "score": verify(of, given).score.to_dict()} if told["score"] is None else told
 
 
 @contextmanager
@@ -94,7 +55,7 @@ def running(folder, *, settings=None, opener=None, over=None, patience=20, **cha
     app = build_app(scene(**changes), sessions, settings, opener)
     address, up, over = [], threading.Event(), over or threading.Event()
 
-    def ready(where):
+    def ready(where, _teaching):
         address.append(where)
         up.set()
 
@@ -107,3 +68,60 @@ def running(folder, *, settings=None, opener=None, over=None, patience=20, **cha
         over.set()
         thread.join(patience)
         assert not thread.is_alive()
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def get(address, path, method="GET", body=None, **headers):
+    where = urlsplit(address)
+    link = http.client.HTTPConnection(where.hostname, where.port, timeout=60)
+    try:
+        link.putrequest(method, path, skip_host="Host" in headers, skip_accept_encoding=True)
+        for name, value in headers.items():
+            link.putheader(name.replace("_", "-"), value)
+        if body is not None:
+            link.putheader("Content-Length", str(len(body)))
+        link.endheaders(body)
+        answer = link.getresponse()
+        return answer.status, {k.lower(): v for k, v in answer.getheaders()}, answer.read()
+    finally:
+        link.close()
+
+
+def post(address, path, content, **headers):
+    """Send JSON; returns the status and the answer, read where it is JSON."""
+    status, kind, body = get(address, path, "POST", json.dumps(content).encode(), **headers)
+    return status, json.loads(body) if "json" in kind.get("content-type", "") else body.decode()
+
+
+class Page:
+    """What a page hears of its server."""
+
+    def __init__(self, line):
+        self.line = line
+
+    def hear(self, *names, timeout=10.0):
+        """Wait for a message with all these names."""
+        while True:
+            told = json.loads(self.line.recv(timeout))
+            if set(names) <= set(told):
+                return told
+
+
+@contextmanager
+def listening(address, key="", **options):
+    """A page that listens at /poses."""
+    with connect(f"ws{address[4:]}/poses?room={key}", compression=None, **options) as line:
+        yield Page(line)
+
+
+def waited(app, count):
+    """Wait until so many pages listen."""
+    until = time.monotonic() + 10
+    while len(app.state.room.hub.listeners) != count:
+        assert time.monotonic() < until
+        time.sleep(0.01)

@@ -454,31 +454,22 @@ def test_an_asymmetric_picture_of_any_orientation_is_turned_to_mf(
 
 
 def test_pages_follow_the_tracker_that_steers_the_link(tmp_path: Path) -> None:
-    """`echospline live --link`: what the tracker does is seen by the page's own engine."""
-    from websockets.sync.client import connect  # noqa: PLC0415
-
+    """`echospline live --link`: what the tracker does is told to every page."""
     from echospline.viewer import steer  # noqa: PLC0415
-    from echospline.viewer.protocol import PoseCommand, decode_frame, encode_command  # noqa: PLC0415
-    from live_scene import running  # noqa: PLC0415
+    from live_scene import listening, running  # noqa: PLC0415
 
     with (
         running(tmp_path) as (address, _, app),
+        listening(address) as page,
         Session(
             make_stage(), SessionOptions(port=0), moved=lambda pose, new: steer(app, pose, new)
         ) as session,
-        connect(address.replace("http", "ws") + "/live") as page,
     ):
-        page.recv(PATIENCE)
         console = Console(session.port)
         console.tip(pose_at(0.5))
         console.tip(pose_at(9.0))
-        tip, drawn = (0.0, 0.0), 0
-        while not np.allclose(tip, pose_at(9.0).tip, atol=1e-3):
-            data = page.recv(PATIENCE)
-            if isinstance(data, bytes):
-                frame = decode_frame(data)
-                tip, drawn = frame.tip, drawn + 1
-                page.send(encode_command(PoseCommand(frame.number, drawn, 0.0, None)))
+        while not np.allclose(page.hear("tip")["tip"], pose_at(9.0).tip, atol=1e-3):
+            pass
         console.close()
 
 

@@ -25,12 +25,10 @@ from echospline.io import read_displacement, read_image
 from echospline.live import Trace
 from echospline.openigtlink import Message, Transform
 from echospline.openigtlink.message import encode
-from echospline.scenario import MODELS
+from echospline.page import Pack, score
 from echospline.scene import AXIAL, ImagingPlane, Insertion, NeedlePose
-from echospline.viewer import Sessions, score
-from echospline.viewer.protocol import SPLINE
-from live_scene import running
-from test_viewer_server import get, page
+from echospline.viewer import Sessions
+from live_scene import get, listening, post, recorded, running
 
 PERIOD = 1 / 120
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
@@ -52,7 +50,7 @@ def invoke(*arguments):
 def kept(tmp_path):
     """A file with one session of a needle that goes 6 mm into the calf."""
     scene, _ = small_scene(**{"output.formats": "mha", "output.figure": False, "output.fps": "20"})
-    exercise = scene.exercises[0]
+    exercise = scene.pack.manifest.exercises[0]
     path = Insertion.straight((10.0, 0.0), 50.0, 6.0, 20.0)
     poses = [path.pose(PERIOD * k) for k in range(1, round(path.duration / PERIOD) + 1)]
     rows = np.array([(*p.entry, *p.tip, p.speed) for p in poses])
@@ -70,33 +68,30 @@ def kept(tmp_path):
     return sessions.path, trace
 
 
-def test_live_serves_the_page_and_the_real_model_and_ends_when_told(tmp_path):
-    command = [sys.executable, "-m", "echospline", "live", "--no-browser", "--port", "0", "--mesh", "12x9", "--splines",
-               "--sessions", str(tmp_path / "deep" / "kept.sqlite")]  # fmt: skip
+def test_live_serves_its_scene_takes_a_session_and_ends_when_told(tmp_path):
+    command = [sys.executable, "-m", "echospline", "live", "--no-browser", "--port", "0", "--mesh", "12x9", "--language", "de",
+               "--rate", "60", "--sessions", str(tmp_path / "deep" / "kept.sqlite")]  # fmt: skip
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         try:
             said = next(line for line in process.stderr if "http://" in line)  # after a first compilation
             address = re.search(r"http://\S+", said).group().rstrip("/")
-            with page(address) as client:
-                assert [m["name"] for m in client.hello["scene"]["models"]] == [
-                    "green",
-                    *(m for m in MODELS if m != "green"),
-                ]
-                entry = tuple(client.hello["pose"]["entry"])
-                client.ask(do="model", name="tps")
-                frame = client.until(
-                    lambda f: f.flags & SPLINE and f.largest > 0.2, (*entry, 50.0, 8.0), timeout=90
-                )
-                assert frame.spline is not None  # landmarks and weights, not nodes
-                client.ask(do="model", name="fem")
-                frame = client.until(lambda f: not f.flags & SPLINE, timeout=90)
-                assert frame.displacement.shape == (12 * 9, 2)
-                assert frame.largest > 0.2
+            pack = Pack.from_bytes(get(address, "/pack")[2])
+            assert (pack.manifest.language, pack.manifest.rate) == ("de", 60.0)
+            assert {"tps", "elastic"} < {model.name for model in pack.manifest.models}
+            assert pack.manifest.models[0].name == "green"
+            assert 'lang="de"' in get(address, "/")[2].decode()
+            x, y = pack.manifest.needle.entry
+            rows = np.array([(x, y, x, y + 0.1 * k, 6.0) for k in range(1, 100)])
+            exercise = pack.manifest.exercises[0].model_dump(mode="json")
+            told = recorded(pack, rows=rows, exercise=exercise, model="tps")
+            status, answer = post(address, "/api/sessions", told)
+            assert (status, answer["verified"]) == (200, True), answer
         finally:
             process.send_signal(signal.SIGINT)
             assert process.wait(60) == 0
         assert "Traceback" not in process.stderr.read()
-    assert (tmp_path / "deep" / "kept.sqlite").exists()
+    (kept,) = Sessions(tmp_path / "deep" / "kept.sqlite").newest()
+    assert kept.verified is True
 
 
 def test_a_tracker_that_is_lost_is_said_on_the_page_of_live_with_its_link(tmp_path):
@@ -110,34 +105,32 @@ def test_a_tracker_that_is_lost_is_said_on_the_page_of_live_with_its_link(tmp_pa
             address = re.search(r"http://\S+", said).group().rstrip("/")
             port = int(re.search(r"OpenIGTLink on 127\.0\.0\.1:(\d+)", said).group(1))
             tip = ImagingPlane(AXIAL).tip_matrix(NeedlePose((20.0, 0.0), (20.0, 8.0)))
-            with page(address) as client, socket.create_connection(("127.0.0.1", port)) as tracker:
+            with listening(address) as page, socket.create_connection(("127.0.0.1", port)) as tracker:
                 tracker.sendall(encode(Message(Transform(tip), "NeedleTipToReference")))
-                client.until(lambda f: f.tip[1] > 7.0, timeout=30)
+                assert page.hear("tip", timeout=30)["tip"] == pytest.approx([20.0, 8.0])
                 bad = Message(
                     Transform(np.eye(4)), "NeedleTipToReference", 0.0, 2, {"TransformStatus": "MISSING"}
                 )
                 tracker.sendall(encode(bad))
-                assert "NeedleTipToReference is MISSING" in client.hear("tracker")["text"]
-                assert client.until(lambda f: True).tip[1] > 7.0
+                assert "NeedleTipToReference is MISSING" in page.hear("tracker")["tracker"]
                 tracker.sendall(encode(Message(Transform(tip), "NeedleTipToReference")))
-                assert client.hear("tracker")["text"] == ""
-                assert re.search(r"silent for 1\.\d s", client.hear("tracker")["text"])
+                assert page.hear("tracker")["tracker"] == ""
+                assert re.search(r"silent for 1\.\d s", page.hear("tracker")["tracker"])
         finally:
             process.send_signal(signal.SIGINT)
             assert process.wait(60) == 0
         assert "Traceback" not in process.stderr.read()
 
 
-def test_every_model_can_be_steered_in_a_scene():
+def test_finite_elements_of_a_scene_are_on_its_packs_mesh():
     scene, _ = small_scene()
-    for name, _ in scene.names:
-        model = scene.models(name)
-        state = model.rest()
-        for k in range(1, 5):
-            state = model.advance(
-                state, Insertion.straight((10.0, 0.0), 50.0, 4.0, 20.0).pose(k / 20), 1 / 20
-            )
-        assert np.abs(model.displacement(state)).max() > 0.05, name
+    model = scene.fem()
+    state = model.rest()
+    for k in range(1, 5):
+        state = model.advance(state, Insertion.straight((10.0, 0.0), 50.0, 4.0, 20.0).pose(k / 20), 1 / 20)
+    moved = model.displacement(state)
+    assert moved.shape == (scene.pack.mesh.size, 2)
+    assert np.abs(moved).max() > 0.05
 
 
 def test_a_needle_outside_the_image_is_refused():
@@ -150,8 +143,8 @@ def test_an_uploaded_picture_becomes_a_scene(tmp_path):
     picture = tmp_path / "a.png"
     Image.fromarray(np.full((50, 80), 90, np.uint8)).save(picture)
     opened = opener_for(scenario)(picture, (0.5, 0.5))
-    assert opened.grid.extent == pytest.approx((0.0, 39.5, 0.0, 24.5))
-    assert opened.grid.contains(opened.entry).all()
+    assert opened.pack.mesh.extent == pytest.approx((0.0, 39.5, 0.0, 24.5))
+    assert opened.pack.mesh.contains(tuple(opened.pack.manifest.needle.entry)).all()
     with pytest.raises(InputError, match="spacing"):
         opener_for(scenario)(picture, None)
 
@@ -191,15 +184,13 @@ def test_a_session_in_an_uploaded_picture_becomes_a_cine_when_the_server_is_gone
     _, scenario = small_scene(**{"output.formats": "mha", "output.figure": False, "output.fps": "20"})
     path = tmp_path / "served" / "sessions.sqlite"
     with running(tmp_path / "served", opener=opener_for(scenario)) as (address, _, _):
-        status, _, said = get(address, "/api/upload?name=mine.png&spacing=0.25", "POST", picture.read_bytes())
+        status, _, said = get(address, "/api/open?name=mine.png&spacing=0.25", "POST", picture.read_bytes())
         assert status == 200
-        with page(address, f"?scene={json.loads(said)['scene']}") as client:
-            name = client.hello["scene"]["exercises"][0]["name"]
-            client.ask(do="start", exercise=name, trainee="Di")
-            client.hear("running")
-            client.push(5.0, entry=tuple(client.hello["pose"]["entry"]))
-            client.ask(do="finish", keep=True)
-            number = client.hear("summary")["session"]
+        pack = Pack.from_bytes(said)
+        x, y = pack.manifest.needle.entry
+        rows = np.array([(x, y, x, y + 0.1 * k, 12.0) for k in range(1, 60)])
+        told = recorded(pack, rows=rows, exercise=pack.manifest.exercises[0].model_dump(mode="json"))
+        number = post(address, "/api/sessions", told)[1]["number"]
     picture.unlink()
     if moved:
         path = (tmp_path / "served").rename(tmp_path / "elsewhere") / path.name
@@ -231,4 +222,4 @@ def test_the_example_course_opens_with_its_exercises():
     scenario, folder = scenario_from(str(EXAMPLES / "training.toml"), {"mesh.nodes": "12x9"})
     opened = scene_of(scenario, scenario.read_image(folder), folder)
     assert opened.title == "Calf: biopsy course"
-    assert [len(exercise.vessels) for exercise in opened.exercises] == [0, 0, 2]
+    assert [len(exercise.vessels) for exercise in opened.pack.manifest.exercises] == [0, 0, 2, 2]

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 import signal
 import socket
-import sqlite3
 import subprocess
 import sys
 import threading
@@ -23,26 +23,29 @@ from PIL import Image
 
 from echospline.cli.live import opener_for
 from echospline.errors import InputError
+from echospline.page import Pack, packed
 from echospline.scenario import Scenario
-from echospline.scene import UltrasoundImage
-from echospline.viewer import Sessions, Settings, UploadLimits, announce
+from echospline.scene import RegularGrid, UltrasoundImage
+from echospline.viewer import Settings, UploadLimits, announce
 from echospline.viewer import idle as idle_module
 from echospline.viewer.pictures import KEPT_UNUSED, Pictures
+from echospline.viewer.reference import MOST_ROWS
 from echospline.viewer.words import for_page
-from live_scene import IMAGE_GRID, running, scene, speckle
-from test_viewer_server import get, page
+from live_scene import fem, get, listening, pack, post, recorded, running, scene
+from page_scene import poses, scenario
 
-QUICK = UploadLimits(deadline=20.0, stall=0.6, floor=20_000.0, grace=0.3, reading=20.0)
+QUICK = UploadLimits(deadline=20.0, stall=2.0, floor=20_000.0, grace=0.3, reading=20.0)
 SEATS = ["ab" * 16, "cd" * 16, "ef" * 16]
 
 
 def picture_scene(path, spacing):
     """The scene of a stored picture, which is any file that Pillow reads."""
     try:
-        pixels = np.asarray(Image.open(path).convert("L").resize((161, 121)))
+        pixels = np.asarray(Image.open(path).convert("L"))
     except OSError as error:
         raise InputError(f"{path} is no image: give --spacing") from error
-    return scene(title="Your image", image=UltrasoundImage(pixels, IMAGE_GRID))
+    size = spacing or (0.2, 0.2)
+    return scene(title=f"{int(pixels[0, 0])} of {size[0]:g} mm")
 
 
 def png(folder: Path, shade: int = 90) -> bytes:
@@ -60,9 +63,9 @@ def begun(address: str, head: str, body: bytes = b""):
         yield line
 
 
-def post(size: int, seat: str = "") -> str:
+def head_of(size: int, seat: str = "") -> str:
     return (
-        f"POST /api/upload?name=a.png&spacing=0.2&seat={seat} HTTP/1.1\nHost: 127.0.0.1\n"
+        f"POST /api/open?name=a.png&spacing=0.2&page={seat} HTTP/1.1\nHost: 127.0.0.1\n"
         f"Content-Length: {size}\n\n"
     )
 
@@ -76,7 +79,7 @@ def answer(line: socket.socket) -> str:
 
 
 def upload(address: str, body: bytes, seat: str = "", name: str = "a.png", spacing: str = "0.2"):
-    return get(address, f"/api/upload?name={name}&spacing={spacing}&seat={seat}", "POST", body)
+    return get(address, f"/api/open?name={name}&spacing={spacing}&page={seat}", "POST", body)
 
 
 # --- uploads
@@ -84,7 +87,7 @@ def upload(address: str, body: bytes, seat: str = "", name: str = "a.png", spaci
 
 def test_a_stalled_upload_ends_by_itself_and_holds_no_other_up(tmp_path):
     with running(tmp_path, settings=Settings(port=0, uploads=QUICK), opener=picture_scene) as (address, _, _):
-        with begun(address, post(1000, SEATS[0]), b"ab") as line:
+        with begun(address, head_of(1000, SEATS[0]), b"ab") as line:
             assert upload(address, png(tmp_path), SEATS[1])[0] == 200
             assert upload(address, png(tmp_path), SEATS[0])[0] == 429  # one per client
             said = answer(line)
@@ -96,7 +99,7 @@ def test_a_stalled_upload_ends_by_itself_and_holds_no_other_up(tmp_path):
 def test_an_upload_that_drips_below_the_floor_is_ended(tmp_path):
     with (
         running(tmp_path, settings=Settings(port=0, uploads=QUICK), opener=picture_scene) as (address, _, _),
-        begun(address, post(100_000)) as line,
+        begun(address, head_of(100_000)) as line,
     ):
         over = threading.Event()
 
@@ -120,7 +123,7 @@ def test_an_upload_has_a_deadline(tmp_path):
     limits = UploadLimits(deadline=1.0, stall=20.0, floor=0.0)
     with (
         running(tmp_path, settings=Settings(port=0, uploads=limits), opener=picture_scene) as (address, _, _),
-        begun(address, post(1000), b"ab") as line,
+        begun(address, head_of(1000), b"ab") as line,
     ):
         assert answer(line).startswith("HTTP/1.1 408")
 
@@ -131,7 +134,7 @@ def test_a_client_that_leaves_in_mid_upload_leaves_nothing_behind(tmp_path, capl
         sessions,
         _,
     ):
-        with begun(address, post(1000), b"ab"):
+        with begun(address, head_of(1000), b"ab"):
             time.sleep(0.2)
         until = time.monotonic() + 10
         while list(sessions.pictures.folder.glob("*")) and time.monotonic() < until:
@@ -169,7 +172,7 @@ def test_a_picture_that_takes_too_long_to_read_is_given_up_and_others_are_read(t
 
 
 def test_a_size_announced_beyond_the_limit_is_refused_before_a_byte_comes(tmp_path):
-    with running(tmp_path, opener=picture_scene) as (address, _, _), begun(address, post(10**12)) as line:
+    with running(tmp_path, opener=picture_scene) as (address, _, _), begun(address, head_of(10**12)) as line:
         line.settimeout(20)
         assert line.recv(4096).startswith(b"HTTP/1.1 413")
 
@@ -185,7 +188,7 @@ def impatient(monkeypatch):
 
 
 def test_two_hundred_half_open_connections_are_closed_and_a_page_lives_on(impatient, tmp_path):
-    with running(tmp_path) as (address, _, _), page(address) as client, ExitStack() as stack:
+    with running(tmp_path) as (address, _, app), listening(address) as page, ExitStack() as stack:
         lines = [
             stack.enter_context(begun(address, "GET / HTTP/1.1\nHost: 127.0.0.1\nX-Slow: "))
             for _ in range(200)
@@ -193,7 +196,8 @@ def test_two_hundred_half_open_connections_are_closed_and_a_page_lives_on(impati
         for line in lines:
             line.settimeout(20)
             assert not line.recv(100)  # the end; a timeout would raise
-        client.push(6.0)
+        announce(app, "still here")
+        assert page.hear("tracker")["tracker"] == "still here"
 
 
 def test_a_byte_now_and_then_keeps_no_unfinished_headers_open(impatient, tmp_path):
@@ -212,16 +216,21 @@ def test_a_byte_now_and_then_keeps_no_unfinished_headers_open(impatient, tmp_pat
                 break
 
 
+def large_pack():
+    """A scene of 4000 x 4000 pixels."""
+    grid = RegularGrid((4000, 4000), (0.008, 0.005))
+    pixels = np.random.default_rng(2).integers(0, 200, (4000, 4000), dtype=np.uint8)
+    return packed(scenario(), UltrasoundImage(pixels, grid, "large"), Path())
+
+
 def test_an_answer_that_nobody_reads_is_given_up(impatient, tmp_path):
-    grid = IMAGE_GRID.covering(IMAGE_GRID, (4000, 4000))
-    large = UltrasoundImage(np.zeros((4000, 4000), np.uint8), grid)
-    with running(tmp_path, image=large) as (address, _, _):
+    with running(tmp_path, pack=large_pack()) as (address, _, _):
         where = urlsplit(address)
         line = socket.socket()
         line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         line.connect((where.hostname, where.port))
         line.settimeout(20)
-        line.sendall(b"GET /api/image HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        line.sendall(b"GET /pack HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
         time.sleep(3.0)
         size = 0
         try:
@@ -234,15 +243,13 @@ def test_an_answer_that_nobody_reads_is_given_up(impatient, tmp_path):
 
 
 def test_an_answer_that_is_read_slowly_comes_whole(impatient, tmp_path):
-    grid = IMAGE_GRID.covering(IMAGE_GRID, (4000, 4000))
-    large = UltrasoundImage(np.zeros((4000, 4000), np.uint8), grid)
-    with running(tmp_path, image=large) as (address, _, _):
+    with running(tmp_path, pack=large_pack()) as (address, _, _):
         where = urlsplit(address)
         line = socket.socket()
         line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
         line.connect((where.hostname, where.port))
         line.settimeout(20)
-        line.sendall(b"GET /api/image HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: close\r\n\r\n")
+        line.sendall(b"GET /pack HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: close\r\n\r\n")
         size, until = 0, time.monotonic() + 3.0  # three times what an idle connection has
         while piece := line.recv(1 << 20):
             size += len(piece)
@@ -261,8 +268,8 @@ def test_a_connection_that_is_used_again_and_again_stays_open(impatient, tmp_pat
         link.connect()
         first = link.sock
         for _ in range(6):
-            link.request("GET", "/api/sessions")
-            assert link.getresponse().read() == b"[]"
+            link.request("GET", "/api/sessions?trainee=Bo")
+            assert json.loads(link.getresponse().read())["sessions"] == []
             time.sleep(0.4)
         assert link.sock is first
         link.close()
@@ -272,17 +279,23 @@ def test_a_connection_that_is_used_again_and_again_stays_open(impatient, tmp_pat
 
 
 def test_the_first_ctrl_c_ends_a_busy_server_within_three_seconds(tmp_path):
-    """A stalled upload, unfinished headers, an answer nobody reads and an open web socket."""
+    """A stalled upload, unfinished headers, an open web socket, and finite elements at work."""
     command = [sys.executable, "-m", "echospline", "live", "--no-browser", "--port", "0", "--mesh", "12x9",
                "--sessions", str(tmp_path / "kept.sqlite")]  # fmt: skip
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process, ExitStack() as stack:
         try:
             said = next(line for line in process.stderr if "http://" in line)
             address = re.search(r"http://\S+", said).group().rstrip("/")
-            stack.enter_context(begun(address, post(10_000_000, SEATS[0]), b"ab"))
+            stack.enter_context(begun(address, head_of(10_000_000, SEATS[0]), b"ab"))
             stack.enter_context(begun(address, "GET / HTTP/1.1\nX: "))
-            client = stack.enter_context(page(address))
-            client.push(4.0, entry=tuple(client.hello["pose"]["entry"]))
+            stack.enter_context(listening(address))
+            pack = Pack.from_bytes(get(address, "/pack")[2])
+            (x, y), depths = pack.manifest.needle.entry, np.linspace(0.0, 20.0, MOST_ROWS)
+            rows = np.array([(x, y, x, y + depth, 0.3) for depth in depths]).astype("<f8")
+            body = json.dumps({"pack": pack.digest, "rows": base64.b64encode(rows.tobytes()).decode()})
+            head = f"POST /api/fem HTTP/1.1\nHost: 127.0.0.1\nContent-Length: {len(body)}\n\n"
+            stack.enter_context(begun(address, head, body.encode()))
+            time.sleep(0.5)
             process.send_signal(signal.SIGINT)
             assert process.wait(3.0) == 0
         finally:
@@ -291,35 +304,41 @@ def test_the_first_ctrl_c_ends_a_busy_server_within_three_seconds(tmp_path):
 
 
 def test_a_picture_being_read_does_not_delay_the_end(tmp_path):
-    """Nor does a model being built."""
-    entered, go = threading.Event(), threading.Event()
+    """Nor do finite elements that are set up."""
+    entered, following, go = threading.Event(), threading.Event(), threading.Event()
 
     def opener(path, spacing):
         entered.set()
         go.wait(60)
         return scene()
 
-    def models(name):
-        if threading.current_thread().name == "echospline-engine":
-            go.wait(60)
-        return scene().models(name)
+    def slow():
+        following.set()
+        go.wait(60)
+        return fem()
 
-    over = threading.Event()
+    def asking(address):
+        rows = base64.b64encode(poses()[:9].astype("<f8").tobytes()).decode()
+        answers.append(post(address, "/api/fem", {"pack": pack().digest, "rows": rows})[0])
+
+    over, answers = threading.Event(), []
     try:
-        with running(tmp_path, opener=opener, models=models, over=over, patience=3.0) as (address, _, _):
-            answers = []
-            stuck = threading.Thread(target=lambda: answers.append(upload(address, b"good")[0]))
-            stuck.start()
+        with running(tmp_path, opener=opener, fem=slow, over=over, patience=3.0) as (address, _, _):
+            stuck = [
+                threading.Thread(target=lambda: answers.append(upload(address, b"good")[0])),
+                threading.Thread(target=asking, args=(address,)),
+            ]
+            for thread in stuck:
+                thread.start()
             assert entered.wait(20)
-            with page(address) as client:
-                client.ask(do="model", name="stiff")
-                client.until(lambda f: True)
-                over.set()
-                time.sleep(0.1)
+            assert following.wait(20)
+            over.set()
+            time.sleep(0.1)
     finally:
         go.set()
-    stuck.join(20)
-    assert answers == [503]
+    for thread in stuck:
+        thread.join(20)
+    assert answers == [503, 503]
 
 
 # --- messages
@@ -361,13 +380,13 @@ def test_a_message_of_an_upload_holds_no_path_and_no_option(tmp_path):
 
 
 def test_other_messages_hold_no_path_either(tmp_path):
-    with running(tmp_path) as (address, sessions, _), page(address) as client:
-        said = get(address, "/api/sessions/99.csv")[2].decode()
-        client.ask(do="replay", session=99)
-        for text in (said, client.hear("notice")["text"]):
-            assert "no session 99" in text
-            assert str(sessions.path) not in text
-            assert "sqlite" not in text
+    with running(tmp_path) as (address, sessions, _):
+        sessions.path.rename(tmp_path / "elsewhere")
+        sessions.path.mkdir()
+        status, _, said = get(address, "/api/sessions?trainee=Bo")
+        assert status >= 400
+        assert str(tmp_path) not in said.decode()
+        assert "sqlite" not in said.decode()
 
 
 WORDS = st.text("abcdefgh ,.()", min_size=1, max_size=20)
@@ -401,124 +420,86 @@ def test_the_uploaded_file_is_called_this_file(tmp_path):
 # --- stored pictures
 
 
-def train(client, exercise="straight-down"):
-    client.ask(do="start", exercise=exercise, trainee="Bo")
-    client.hear("running")
-    client.push(6.0)
-    client.ask(do="finish", keep=True)
-    return client.hear("summary")
+def opened(address, body, spacing="0.2"):
+    status, _, data = upload(address, body, spacing=spacing)
+    assert status == 200, data
+    return Pack.from_bytes(data)
 
 
-def test_a_session_in_an_uploaded_picture_is_replayed_after_a_restart(tmp_path):
+def test_a_session_in_an_uploaded_picture_is_taken_after_a_restart(tmp_path):
     with running(tmp_path, opener=picture_scene) as (address, _, _):
-        name = json.loads(upload(address, png(tmp_path))[2])["scene"]
-        with page(address, f"?scene={name}") as client:
-            summary = train(client)
-    with running(tmp_path, opener=picture_scene) as (address, _, _):
-        with page(address, f"?scene={name}") as client:
-            assert client.hello["scene"]["title"] == "Your image"
-            client.ask(do="replay", session=summary["session"])
-            again = client.hear("summary", timeout=30)
-            assert again["replayed"]
-            assert again["score"] == summary["score"]
-        assert get(address, f"/api/image?scene={name}")[2][:100] == bytes([90] * 100)
-
-
-def test_a_replay_in_another_picture_is_refused_and_says_where_it_belongs(tmp_path):
-    with running(tmp_path, opener=picture_scene) as (address, _, _):
-        first, second = (json.loads(upload(address, png(tmp_path, shade))[2])["scene"] for shade in (90, 91))
-        with page(address, f"?scene={first}") as client:
-            number = train(client)["session"]
-        for query, home in (("", ""), (f"?scene={second}", second)):
-            with page(address, query) as other:
-                other.ask(do="replay", session=number)
-                told = other.hear("elsewhere")
-                assert (told["scene"], told["session"]) == (first, number)
-                assert "another picture" in told["text"]
-                assert other.hello["scene"]["upload"] == home
-                other.push(3.0)
+        mine = opened(address, png(tmp_path))
+    told = recorded(mine)
+    with running(tmp_path, opener=picture_scene) as (address, sessions, _):
+        status, answer = post(address, "/api/sessions", told)
+        assert (status, answer["verified"]) == (200, True)
+        assert sessions.load(answer["number"])[0].upload == mine.digest[:16]
+    with running(tmp_path, opener=lambda *_: scene(title="Other tissue")) as (address, _, _):
+        status, said = post(address, "/api/sessions", {**told, "trainee": "Late"})
+        assert (status, "does not have" in said) == (422, True)
 
 
 def test_a_picture_stays_as_long_as_its_sessions(tmp_path):
     with running(tmp_path, opener=picture_scene) as (address, sessions, _):
-        used, unused = (json.loads(upload(address, png(tmp_path, shade))[2])["scene"] for shade in (90, 91))
-        with page(address, f"?scene={used}") as client:
-            train(client)
-    folder = sessions.pictures.folder
-    sessions.pictures.sweep(sessions.needs)
-    assert sessions.pictures.find(unused) is not None  # not at once: its page may come back
-    sessions.pictures.sweep(sessions.needs, time.time() + KEPT_UNUSED + 60)
-    assert sessions.pictures.find(unused) is None
-    assert sessions.pictures.find(used) is not None
-    assert len(list(folder.iterdir())) == 2  # the picture and its record
-    assert Pictures(folder).find("../../../etc/pas") is None
+        used, unused = (opened(address, png(tmp_path, shade)) for shade in (90, 91))
+        assert post(address, "/api/sessions", recorded(used))[0] == 200
+    pictures = sessions.pictures
+    pictures.sweep(sessions.needs)
+    assert pictures.find(unused.digest[:16]) is not None  # not at once: its page may come back
+    pictures.sweep(sessions.needs, time.time() + KEPT_UNUSED + 60)
+    assert pictures.find(unused.digest[:16]) is None
+    assert pictures.find(used.digest[:16]) is not None
+    assert len(list(pictures.folder.iterdir())) == 2  # the picture and its record
+    assert Pictures(pictures.folder).find("../../../etc/pas") is None
 
 
-def test_a_scene_that_was_dropped_from_memory_is_opened_again_if_it_has_sessions(tmp_path, monkeypatch):
+def test_a_scene_that_was_dropped_from_memory_is_opened_again(tmp_path, monkeypatch):
     monkeypatch.setattr("echospline.viewer.room.UPLOADED_SCENES", 1)
-    with running(tmp_path, opener=picture_scene) as (address, sessions, app):
-        used = json.loads(upload(address, png(tmp_path, 90))[2])["scene"]
-        with page(address, f"?scene={used}") as client:
-            train(client)
-        unused, last = (json.loads(upload(address, png(tmp_path, shade))[2])["scene"] for shade in (91, 92))
-        assert sorted(app.state.room.scenes) == ["", last]
-        assert sessions.pictures.find(unused) is None
-        assert get(address, f"/api/image?scene={unused}")[0] == 404
-        assert get(address, f"/api/image?scene={used}")[2][:100] == bytes([90] * 100)
+    with running(tmp_path, opener=picture_scene) as (address, _, app):
+        first, second = (opened(address, png(tmp_path, shade)) for shade in (90, 91))
+        assert list(app.state.room.opened) == [second.digest]
+        assert post(address, "/api/sessions", recorded(first))[1]["verified"]
+        assert list(app.state.room.opened) == [first.digest]
+
+
+def test_only_so_many_pictures_without_a_session_are_kept(tmp_path, monkeypatch):
+    monkeypatch.setattr("echospline.viewer.routes.UNUSED_PICTURES", 2)
+    with running(tmp_path, opener=picture_scene) as (address, sessions, _):
+        used = opened(address, png(tmp_path, 80))
+        assert post(address, "/api/sessions", recorded(used))[0] == 200
+        packs = [opened(address, png(tmp_path, shade)) for shade in (90, 91, 92)]
+        kept = [sessions.pictures.find(mine.digest[:16]) is not None for mine in (used, *packs)]
+        assert kept == [True, False, True, True]
 
 
 def test_the_same_file_in_two_sizes_is_two_scenes_of_one_file(tmp_path):
     with running(tmp_path, opener=picture_scene) as (address, sessions, _):
-        one, two = (
-            json.loads(upload(address, png(tmp_path), spacing=size)[2])["scene"] for size in ("0.2", "0.4")
-        )
-        assert one != two
-        assert json.loads(upload(address, png(tmp_path))[2])["scene"] == one
+        one, two = (opened(address, png(tmp_path), size) for size in ("0.2", "0.4"))
+        assert one.digest != two.digest
+        assert opened(address, png(tmp_path)).digest == one.digest
         assert len(list(sessions.pictures.folder.glob("*.png"))) == 1
-        sessions.pictures.drop(one)
-        assert sessions.pictures.find(two) is not None
+        sessions.pictures.drop(one.digest[:16])
+        assert sessions.pictures.find(two.digest[:16]) is not None
 
 
-def test_sessions_of_the_first_schema_are_read_and_replayed_in_a_scene_of_their_title(tmp_path):
-    with running(tmp_path) as (address, sessions, _), page(address) as client:
-        number = train(client)["session"]
-    database = sqlite3.connect(sessions.path)
-    with database:
-        for column in ("picture", "upload"):
-            database.execute(f"ALTER TABLE session DROP COLUMN {column}")
-        database.execute("PRAGMA user_version = 1")
-    database.close()
-    assert Sessions(sessions.path).load(number)[0].picture == ""
-    with running(tmp_path) as (address, _, _), page(address) as client:
-        client.ask(do="replay", session=number)
-        assert client.hear("running")["replay"]
-    with running(tmp_path, title="Another") as (address, _, _), page(address) as client:
-        client.ask(do="replay", session=number)
-        assert "another picture" in client.hear("elsewhere")["text"]
+def test_a_file_that_fails_takes_no_other_with_it(tmp_path):
+    """The same file is opened twice at once, by two pages, and only one of them says its pixels' size."""
+    waiting, go = threading.Event(), threading.Event()
 
+    def opener(path, spacing):
+        if spacing is None:
+            raise InputError("fill it in")
+        waiting.set()
+        assert go.wait(20)
+        return picture_scene(path, spacing)
 
-def test_pictures_differ_by_a_pixel_and_by_their_spacing():
-    grey = speckle()
-    other = grey.copy()
-    other[5, 5] ^= 1
-    wider = IMAGE_GRID.covering(IMAGE_GRID, IMAGE_GRID.shape)
-    names = {
-        scene(image=UltrasoundImage(pixels, grid)).picture
-        for pixels, grid in ((grey, IMAGE_GRID), (other, IMAGE_GRID), (grey.astype(np.uint16), IMAGE_GRID))
-    }
-    assert len(names) == 3
-    assert scene(image=UltrasoundImage(grey, wider)).picture in names
-
-
-# --- the tracker
-
-
-def test_pages_are_told_when_the_tracker_is_lost_and_when_it_is_back(tmp_path):
-    with running(tmp_path) as (address, _, app), page(address) as early:
-        announce(app, "The tracker: stale")
-        assert early.hear("tracker")["text"] == "The tracker: stale"
-        with page(address) as late:
-            assert late.told.get("tracker", late.hear("tracker"))["text"] == "The tracker: stale"
-            announce(app, "")
-            assert early.hear("tracker")["text"] == ""
-            assert late.hear("tracker")["text"] == ""
+    with running(tmp_path, opener=opener) as (address, sessions, _):
+        answers = []
+        good = threading.Thread(target=lambda: answers.append(upload(address, png(tmp_path), SEATS[0])[0]))
+        good.start()
+        assert waiting.wait(20)
+        assert upload(address, png(tmp_path), SEATS[1], spacing="")[0] == 422
+        go.set()
+        good.join(20)
+        assert answers == [200]
+        assert len(list(sessions.pictures.folder.glob("*.png"))) == 1

@@ -22,19 +22,21 @@ from websockets.sync.client import connect
 
 from echospline.cli.app import app
 from echospline.errors import InputError
-from echospline.viewer import Settings
+from echospline.page import Pack, core_bytes
+from echospline.scene import NeedlePose
+from echospline.viewer import Settings, steer
 from echospline.viewer.guard import Guard, checked_origin
-from live_scene import running, scene, speckle
-from test_viewer_server import Page, get, page
+from live_scene import Page, free_port, get, listening, pack, recorded, running, scene
 
 OUTSIDE = "https://sim.example.org"
 DOCS = Path(__file__).resolve().parent.parent / "docs" / "live.md"
 TOKEN = "a-word-that-nobody-knows"
+KEY = "ab" * 16
 
 
 def scope(**headers: str):
     pairs = [(name.encode(), value.encode()) for name, value in headers.items()]
-    return {"type": "http", "path": "/api/image", "headers": pairs}
+    return {"type": "http", "path": "/pack", "headers": pairs}
 
 
 # --- origins
@@ -46,28 +48,28 @@ def test_a_proxy_may_keep_host_or_write_its_own(tmp_path, host):
     with running(tmp_path, settings=settings):
         address = f"http://127.0.0.1:{settings.port}"
         bearer = {"Authorization": f"Bearer {TOKEN}"}
-        assert get(address, "/api/image", Host=host, Origin=OUTSIDE, **bearer)[0] == 200
-        assert get(address, "/api/image", Host=host, Origin=OUTSIDE)[0] == 401
-        assert get(address, "/api/image", Host=host, Origin="https://evil.example", **bearer)[0] == 403
-        assert get(address, "/api/image", Host="evil.example", Origin=OUTSIDE, **bearer)[0] == 421
-        with page(address, origin=OUTSIDE, subprotocols=["echospline.1", f"token.{TOKEN}"]) as client:
-            client.push(3.0)
+        assert get(address, "/pack", Host=host, Origin=OUTSIDE, **bearer)[0] == 200
+        assert get(address, "/pack", Host=host, Origin=OUTSIDE)[0] == 401
+        assert get(address, "/pack", Host=host, Origin="https://evil.example", **bearer)[0] == 403
+        assert get(address, "/pack", Host="evil.example", Origin=OUTSIDE, **bearer)[0] == 421
+        with listening(address, origin=OUTSIDE, subprotocols=["echospline.1", f"token.{TOKEN}"]) as client:
+            assert client.line.subprotocol == "echospline.1"
 
 
 def test_several_origins_and_none(tmp_path):
-    guard = Guard(lambda *_: None, frozenset({"127.0.0.1"}), None, (OUTSIDE, "http://10.0.0.5:8080"))
+    guard = Guard(lambda *_: None, frozenset({"127.0.0.1"}), (), (OUTSIDE, "http://10.0.0.5:8080"))
     assert guard.refusal(scope(host="127.0.0.1", origin="http://10.0.0.5:8080")) is None
     assert guard.refusal(scope(host="127.0.0.1", origin=OUTSIDE.upper())) is None
     assert guard.refusal(scope(host="127.0.0.1", origin="http://sim.example.org"))[0] == 403
     assert guard.refusal(scope(host="127.0.0.1", origin="https://sim.example.org.evil.example"))[0] == 403
     assert guard.refusal(scope(host="127.0.0.1", origin="null"))[0] == 403
     assert guard.refusal(scope(host="127.0.0.1", origin="https://["))[0] == 403
-    bare = Guard(lambda *_: None, frozenset({"127.0.0.1"}), None)
+    bare = Guard(lambda *_: None, frozenset({"127.0.0.1"}))
     assert bare.refusal(scope(host="127.0.0.1", origin=OUTSIDE))[0] == 403
 
 
 def test_the_operator_is_told_once_what_to_do_and_the_page_is_not(caplog):
-    guard = Guard(lambda *_: None, frozenset({"127.0.0.1"}), None)
+    guard = Guard(lambda *_: None, frozenset({"127.0.0.1"}))
     for _ in range(3):
         assert "--" not in guard.refusal(scope(host="127.0.0.1", origin=OUTSIDE))[1]
     assert len([r for r in caplog.records if "--origin" in r.message]) == 1
@@ -117,11 +119,11 @@ def test_others_than_this_machines_users_need_a_token_unless_the_proxy_knows_the
 def test_the_printed_address_is_the_outside_one(tmp_path):
     from echospline.viewer import Sessions, build_app, serve  # noqa: PLC0415
 
-    settings = Settings(port=0, origins=(OUTSIDE,), token=TOKEN)
+    settings = Settings(port=0, origins=(OUTSIDE,), token=TOKEN, instructor="another")
     built = build_app(scene(), Sessions(tmp_path / "s.sqlite"), settings)
     printed = []
-    serve(built, settings, printed.append, lambda: bool(printed))
-    assert printed == [f"{OUTSIDE}/#token={TOKEN}"]
+    serve(built, settings, lambda *addresses: printed.extend(addresses), lambda: bool(printed))
+    assert printed == [f"{OUTSIDE}/#token={TOKEN}", f"{OUTSIDE}/#token=another"]
 
 
 # --- the examples of the docs
@@ -138,12 +140,6 @@ def changed(text: str, **changes: str) -> str:
         assert old in text, old
         text = text.replace(old, new)
     return text
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 @pytest.fixture(scope="module")
@@ -260,26 +256,35 @@ def test_the_example_of_the_docs_carries_the_page_its_socket_and_an_upload(proxy
         with proxy(tmp_path / "proxy", settings.port, outside, certificate):
             status, index = ask(outside, certificate, "GET", "/")
             assert (status, b"<html" in index) == (200, True)
-            assert ask(outside, certificate, "GET", "/api/image") == (200, speckle().tobytes())
-            assert ask(outside, certificate, "GET", "/api/image", Authorization="Bearer no")[0] == 401
-            assert ask(outside, certificate, "GET", "/api/image", Origin="https://evil.example")[0] == 403
+            status, data = ask(outside, certificate, "GET", "/pack")
+            assert (status, data) == (200, pack().to_bytes())
+            assert ask(outside, certificate, "GET", "/core.wasm") == (200, core_bytes())
+            assert ask(outside, certificate, "GET", "/pack", Authorization="Bearer no")[0] == 401
+            assert ask(outside, certificate, "GET", "/pack", Origin="https://evil.example")[0] == 403
             status, said = ask(
-                outside, certificate, "POST", "/api/upload?name=a.png&spacing=0.2", b"x" * 3_000_000
+                outside, certificate, "POST", "/api/open?name=a.png&spacing=0.2", b"x" * 3_000_000
             )
             assert status == 200, said
-            query = f"?scene={json.loads(said)['scene']}"
+            mine = Pack.from_bytes(said)
+            assert mine.manifest.title == "Through the proxy"
+            told = json.dumps(recorded(mine)).encode()
+            status, said = ask(outside, certificate, "POST", "/api/sessions", told)
+            assert (status, json.loads(said)["verified"]) == (200, True)
 
-            def socket_of(origin: str):
+            def socket_of(path: str, origin: str = OUTSIDE):
                 return connect(
-                    f"ws://sim.example.org/live{query}", sock=through(outside, certificate), origin=origin,
-                    subprotocols=["echospline.1", f"token.{TOKEN}"], compression=None, max_size=None,
+                    f"ws://sim.example.org/{path}?room={KEY}", sock=through(outside, certificate), origin=origin,
+                    subprotocols=["echospline.1", f"token.{TOKEN}"], compression=None,
                 )  # fmt: skip
 
-            with socket_of(OUTSIDE) as line:
-                client = Page(line)
-                assert client.hello["scene"]["title"] == "Through the proxy"
-                client.push(5.0)
-            with pytest.raises(InvalidStatus) as refused, socket_of("https://evil.example"):
+            with socket_of("poses") as line, socket_of("phone") as phone:
+                page = Page(line)
+                page.hear("phone")
+                phone.send('{"turn": [1, 2, 3]}')
+                assert page.hear("turn")["turn"] == [1.0, 2.0, 3.0]
+                steer(served, NeedlePose((8.0, 0.0), (8.0, 5.0)), True)
+                assert page.hear("tip")["tip"] == [8.0, 5.0]
+            with pytest.raises(InvalidStatus) as refused, socket_of("poses", "https://evil.example"):
                 pass
             assert refused.value.response.status_code == 403
     assert clients == ["127.0.0.1"]  # the address that the proxy gives, which is the browser's

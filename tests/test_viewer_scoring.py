@@ -20,14 +20,46 @@ from hypothesis import strategies as st
 
 from echospline.errors import InputError
 from echospline.live import LiveEngine, Recorder, Trace
+from echospline.page import Disc, Exercise, default_exercises, score
+from echospline.page.exercise import check_exercises
+from echospline.page.scoring import redirections, smoothness
 from echospline.scenario import load
-from echospline.scene import Insertion, RegularGrid
-from echospline.viewer import Disc, Exercise, Sessions, default_exercises, score, sessions_csv, trace_csv
-from echospline.viewer.exercise import check_exercises
-from echospline.viewer.scoring import redirections, smoothness
-from live_scene import EXERCISE, PAST, scene
+from echospline.scene import Insertion, NeedlePose, RegularGrid
+from echospline.viewer import Sessions, sessions_csv, trace_csv
 
 PERIOD = 0.01
+MESH = RegularGrid((41, 31), (1.0, 1.0))
+EXERCISE = Exercise(
+    name="straight-down",
+    title="Straight down",
+    goal="Push the tip into the ring.",
+    target=Disc(centre=(20.0, 12.0), radius=3.0),
+)
+PAST = Exercise(
+    name="past",
+    title="Past the vessel",
+    target=Disc(centre=(28.0, 18.0), radius=2.0),
+    vessels=[Disc(centre=(20.0, 10.0), radius=2.0)],
+    most_redirections=0,
+)
+
+
+class Still:
+    """Tissue that does not move."""
+
+    grid = MESH
+
+    def rest(self):
+        return None
+
+    def advance(self, state, pose, dt):
+        return pose
+
+    def displacement(self, state):
+        return np.zeros((MESH.size, 2))
+
+    def displacement_at(self, state, points):
+        return np.zeros(np.shape(points))
 
 
 def trace_of(insertion, exercise=EXERCISE, after=0.0, shift=(0.0, 0.0)):
@@ -155,7 +187,7 @@ def test_redirections_need_the_needle_inside():
 
 
 def test_a_recorder_takes_every_step_and_begins_anew_at_a_reset():
-    live = LiveEngine(scene().models, "soft", scene().home, rate=100.0)
+    live = LiveEngine(lambda _: Still(), "still", NeedlePose((20.0, 0.0), (20.0, 0.0)), rate=100.0)
     live.watch(EXERCISE.landmarks)
     recorder = Recorder(live.period, longest=0.5)
     live.observe(recorder)
@@ -239,17 +271,22 @@ def test_wrong_exercises_are_refused_by_name(tmp_path, old, new, match):
         load(tmp_path / "scenario.toml")
 
 
+def corners(grid):
+    x0, x1, y0, y1 = grid.extent
+    return (x0, y0), (x1, y1)
+
+
 def test_two_exercises_of_one_name_are_refused():
     with pytest.raises(InputError, match="names must differ"):
-        check_exercises([EXERCISE, EXERCISE], scene().grid)
+        check_exercises([EXERCISE, EXERCISE], *corners(MESH))
 
 
 def test_a_target_outside_the_image_is_refused_and_the_default_ones_fit_any():
     outside = Exercise(name="a", title="A", target=Disc(centre=(99.0, 1.0), radius=1.0))
     with pytest.raises(InputError, match="must lie in the image"):
-        check_exercises([outside], scene().grid)
-    for grid in (RegularGrid((5, 90), (3.0, 1.0), (-10.0, 4.0)), scene().grid):
-        check_exercises(default_exercises(grid), grid)
+        check_exercises([outside], *corners(MESH))
+    for grid in (RegularGrid((5, 90), (3.0, 1.0), (-10.0, 4.0)), MESH):
+        check_exercises(default_exercises(grid), *corners(grid))
 
 
 # --- sessions

@@ -9,13 +9,13 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
 from echospline import io as io_room
 from echospline import openigtlink, viewer
-from echospline import picture as picture_room
+from echospline import page as page_room
 from echospline import scenario as scenario_room
 from echospline import scene as scene_room
 from echospline.cli.link import address, make_stage
@@ -24,7 +24,8 @@ from echospline.errors import InputError
 
 LARGEST_UPLOAD = 256.0
 """MiB of one decoded frame; 4096 x 4096 pixels, the most that a page shows, have 128 in double precision."""
-LABELS = {"tps": "TPS", "elastic": "Elastic", "green": "Green", "fem": "FEM"}
+LAST_PATIENCE = 0.5
+"""s for work beside the server when it has ended."""
 
 
 def default_sessions() -> Path:
@@ -73,15 +74,7 @@ def live(
     port: Annotated[int, typer.Option(min=0, max=65535, help="port; 0 takes any free one")] = 8750,
     rate: Annotated[float, typer.Option(min=10, max=1000, help="model steps per second")] = 120.0,
     clients: Annotated[int, typer.Option(min=1, max=1000, help="most pages at once")] = 64,
-    nodes: Annotated[
-        bool | None,
-        typer.Option(
-            "--nodes/--splines",
-            help="what is sent for tps and elastic: every node's displacement (9.6 kB for 1200), or the spline's "
-            "weights (2 kB, more work here, a smooth picture on any mesh); by default weights above 4000 nodes",
-            show_default=False,
-        ),
-    ] = None,
+    language: Annotated[Literal["en", "de"], typer.Option(help="of the page: en or de")] = "en",
     sessions: Annotated[
         Path | None,
         typer.Option(help="file that keeps training sessions; by default in the user's data folder"),
@@ -132,31 +125,34 @@ def live(
     from threadpoolctl import threadpool_limits
 
     scenario, folder = scenario_from(source, changes or {})
+    opened = None
     if scenario_room.is_spatial(scenario):
-        raise InputError(
-            f"the page shows scenes in the plane and {source} is a volume: steer needle and probe from 3D Slicer with "
-            f"echospline link {source}, or write a cine with echospline simulate {source}"
-        )
-    scenario, image = scenario.opened(folder, eight_bit=True)
-    say([*image.notes, *scenario.label_notes(folder)], "note")
-    say(scenario_room.size_doubts(image.grid))
-    scene = scene_of(scenario, image, folder)
-    settings = viewer.Settings(
-        host, port, rate, clients, nodes=nodes, origins=tuple(origin or ()), open_door=not token
-    )
-    scene.models(scene.names[0][0])  # refuses an invalid scenario before a page waits for it
+        if link or link_connect:
+            raise InputError("live follows a tracker in scenes of the plane alone: leave --link out in space")
+        opened = scenario_room.open_spatial(scenario, folder)
+        say(opened.notes, "note")
+        scene = viewer.Scene(page_room.packed_space(opened, language=language, rate=rate))
+    else:
+        scenario, image = scenario.opened(folder, eight_bit=True)
+        say([*image.notes, *scenario.label_notes(folder)], "note")
+        say(scenario_room.size_doubts(image.grid))
+        scene = scene_of(scenario, image, folder, language=language, rate=rate)
+    opener = None if opened is not None else opener_for(scenario, language=language, rate=rate)
+    settings = viewer.Settings(host, port, clients, origins=tuple(origin or ()), open_door=not token)
     console = Console(stderr=True)
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
 
-    def ready(address: str) -> None:
+    def ready(address: str, teaching: str) -> None:
         console.print(f"steer the needle at [bold]{address}[/]", highlight=False, soft_wrap=True)
+        if teaching != address:
+            console.print(f"the instructor sees the class at {teaching}", highlight=False, soft_wrap=True)
         console.print(f"sessions are kept in {kept.path}; Ctrl+C ends", highlight=False, soft_wrap=True)
         if browser:
             webbrowser.open(address)
 
     with ExitStack() as stack:
         kept = _kept(sessions, stack, lambda text: console.print(text, highlight=False, soft_wrap=True))
-        app = viewer.build_app(scene, kept, settings, opener_for(scenario))
+        app = viewer.build_app(scene, kept, settings, opener)
         # an engine's step is short: more threads make it slower and less punctual
         stack.enter_context(threadpool_limits(limits=1))
         if link or link_connect:
@@ -180,44 +176,35 @@ def live(
             stack.enter_context(session)
             console.print(f"OpenIGTLink on 127.0.0.1:{session.port}", highlight=False)
         viewer.serve(app, settings, ready)
+    if viewer.unfinished(LAST_PATIENCE):
+        os._exit(
+            0
+        )  # everything is closed; a file that is read or a solver at work would crash an interpreter that ends
 
 
 def scene_of(
-    scenario: scenario_room.Scenario, image: scene_room.UltrasoundImage, folder: Path
+    scenario: scenario_room.Scenario,
+    image: scene_room.UltrasoundImage,
+    folder: Path,
+    *,
+    language: Literal["en", "de"] = "en",
+    rate: float = 120.0,
 ) -> viewer.Scene:
-    """Build the scene of a scenario: its image, mesh and needle, every model, its exercises or the default three.
+    """Build the scene of a scenario: its pack, and finite elements on the same mesh.
 
     Raises
     ------
     InputError
-        If the point of entry lies outside the image.
+        If the point of entry or an exercise lies outside the image, or the picture is too large for a page.
     """
-    grid = scenario.grid(image)
-    needle = scenario.needle
-    entry, angle = (needle.entry, needle.angle)
-    if not grid.contains(entry).all():
-        x0, x1, y0, y1 = grid.extent
-        raise InputError(
-            f"needle.entry must lie in the image, x from {x0:g} to {x1:g} and y from {y0:g} to {y1:g} mm; got {entry}"
-        )
-    first = scenario.model.kind
     kept = scenario.model_copy(
         update={"image": scenario.image.model_copy(update={"file": _whole(scenario, folder)})}
     )
+    grid = scenario.grid(image)
     return viewer.Scene(
-        title=scenario.title or scenario.image.file.replace("sample:", "Sample: ").rsplit("/", 1)[-1],
-        image=image,
-        grid=grid,
-        models=lambda kind: scenario_room.build_model(scenario, grid, kind=kind, folder=folder),
-        names=tuple(
-            (kind, LABELS[kind]) for kind in sorted(scenario_room.MODELS, key=lambda kind: kind != first)
-        ),
-        entry=entry,
-        angle=angle,
-        echo=scenario.needle_echo()
-        or picture_room.NeedleEcho(shaft=False, tip=False, tail=False, shadow=False),
-        exercises=tuple(scenario.exercise) or viewer.default_exercises(grid),
+        pack=page_room.packed(scenario, image, folder, language=language, rate=rate),
         source=kept.model_dump_json(),
+        fem=lambda: scenario_room.build_model(scenario, grid, kind="fem", folder=folder),
     )
 
 
@@ -228,17 +215,18 @@ def _whole(scenario: scenario_room.Scenario, folder: Path) -> str:
 
 
 def opener_for(
-    scenario: scenario_room.Scenario,
+    scenario: scenario_room.Scenario, *, language: Literal["en", "de"] = "en", rate: float = 120.0
 ) -> Callable[[Path, tuple[float, float] | None], viewer.Scene]:
     """Build a function that turns uploaded images into scenes with the tissue, mesh and model of a scenario."""
 
     def opened(path: Path, spacing: tuple[float, float] | None) -> viewer.Scene:
         values: dict[str, Any] = {"title": "Your image", "image.file": str(path), "image.spacing": spacing, "image.frame": None, "image.window": None,
-                  "image.region": None, "tissue.region": [], "mesh.clamped_points": [], "exercise": []}  # fmt: skip
+                  "image.region": None, "tissue.region": [], "mesh.clamped_points": [], "body": [], "exercise": []}  # fmt: skip
         bare = scenario.with_values(values, "upload")
         io_room.open_recording(path, LARGEST_UPLOAD, whole=False)  # refuses a bomb by its header
         bare, image = bare.opened(path.parent, eight_bit=True)
         x0, x1, y0, _ = bare.grid(image).extent
-        return scene_of(bare.with_values({"needle.entry": (x0 + 0.2 * (x1 - x0), y0)}), image, path.parent)
+        bare = bare.with_values({"needle.entry": (x0 + 0.2 * (x1 - x0), y0)})
+        return scene_of(bare, image, path.parent, language=language, rate=rate)
 
     return opened

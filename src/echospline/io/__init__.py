@@ -4,6 +4,7 @@
 """
 
 from echospline.io.arrays import ArrayInfo, LineCine, list_arrays, open_lines
+from echospline.io.dicom_cine import dicom_cine
 from echospline.io.displacement import (
     DisplacementRecord,
     DisplacementWriter,
@@ -48,6 +49,7 @@ __all__ = [
     "SpatialDisplacementRecord",
     "choose_image",
     "decoding",
+    "dicom_cine",
     "displacement_shapes",
     "head",
     "is_spatial_record",

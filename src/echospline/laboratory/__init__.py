@@ -7,6 +7,8 @@ from echospline.menu import on_demand
 if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.laboratory.acoustic import channel_data
     from echospline.laboratory.beamform import LinearArray, delay_and_sum, demodulate
+    from echospline.laboratory.bodies import Body, Round, Tube
+    from echospline.laboratory.imaged import imaged, imaged_volume
     from echospline.laboratory.kidney import Kidney, kidney
     from echospline.laboratory.kidney_recipe import LabelledTissue, TissueKind
     from echospline.laboratory.needle_field import NeedleField
@@ -23,6 +25,7 @@ else:
 __all__ = [
     "ABDOMINAL",
     "SAMPLE_VOLUMES",
+    "Body",
     "Displacement",
     "Faces",
     "Inclusion",
@@ -32,14 +35,18 @@ __all__ = [
     "LinearArray",
     "NeedleField",
     "Phantom",
+    "Round",
     "Scatterers",
     "Scattering",
     "SpatialPhantom",
     "TissueKind",
+    "Tube",
     "channel_data",
     "delay_and_sum",
     "demodulate",
     "displacement_of",
+    "imaged",
+    "imaged_volume",
     "kidney",
     "phantom_pictures",
     "rescatter",

@@ -14,13 +14,14 @@ if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.mechanics.kernels import Elastic, Kernel, ThinPlate
     from echospline.mechanics.landmark_stiffness import landmark_stiffness
     from echospline.mechanics.landmarks import Clamps
-    from echospline.mechanics.native import describe_core
+    from echospline.mechanics.native import CoreScene, NativeStep, describe_core
     from echospline.mechanics.neo_hookean_model import NeoHookeanModel
     from echospline.mechanics.parameters import TPSParameters
     from echospline.mechanics.plane_in_space import PlaneInSpace
     from echospline.mechanics.protocol import TissueModel
     from echospline.mechanics.spatial_force_model import SpatialForceModel
     from echospline.mechanics.spatial_landmark_model import SpatialLandmarkModel
+    from echospline.mechanics.spatial_scene import SpatialForcedScene, SpatialStep
     from echospline.mechanics.tps import Solver, TPSModel, anchors_for
 else:
     on_demand(__name__)
@@ -28,6 +29,7 @@ else:
 __all__ = [
     "AnchoredKernel",
     "Clamps",
+    "CoreScene",
     "Elastic",
     "FEMModel",
     "ForceModel",
@@ -36,13 +38,16 @@ __all__ = [
     "Forces",
     "GreenModel",
     "Kernel",
+    "NativeStep",
     "NeedleForces",
     "NeedleLoad",
     "NeoHookeanModel",
     "PlaneInSpace",
     "Solver",
     "SpatialForceModel",
+    "SpatialForcedScene",
     "SpatialLandmarkModel",
+    "SpatialStep",
     "TPSModel",
     "TPSParameters",
     "ThinPlate",

@@ -9,8 +9,9 @@ from __future__ import annotations
 import ctypes
 import threading
 import weakref
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from math import prod
 from time import perf_counter
 from typing import Any, Literal
 
@@ -90,23 +91,101 @@ def _level_name(level: int) -> str:
     return name.decode()
 
 
+@dataclass(frozen=True, eq=False)
+class CoreScene:
+    """A scene of landmarks as every host gives it to the core.
+
+    Parameters
+    ----------
+    options : mapping
+        Members of `echospline_scene_options` by their names: numbers, or three of them.
+    clamped_points : ndarray, shape (k, D)
+        mm.
+    stiffness : ndarray, shape (n,), or None
+        Per mesh node; None: infinite.
+
+    Raises
+    ------
+    InputError
+        If a name is no option, or a value has another form than its option.
+    """
+
+    options: Mapping[str, int | float | Sequence[int] | Sequence[float]]
+    clamped_points: Floats
+    stiffness: Floats | None = None
+
+    def __post_init__(self) -> None:
+        _struct(self.options)  # refuses what is no option
+
+    @classmethod
+    def of(
+        cls,
+        grid: RegularGrid | SpatialGrid,
+        clamps: Clamps,
+        parameters: TPSParameters,
+        kernel: Kernel,
+        stiffness: Floats | None,
+        precision: Precision,
+    ) -> CoreScene:
+        """Return the scene of a mesh.
+
+        Parameters
+        ----------
+        grid : RegularGrid or SpatialGrid
+            The mesh, in the plane (D = 2) or in space (D = 3).
+        clamps : Clamps
+            The clamped and sliding edges (faces), and clamped points.
+        parameters : TPSParameters
+            Of the interaction.
+        kernel : Kernel
+            `ThinPlate` or `Elastic`.
+        stiffness : ndarray, shape (n,), or None
+            Per mesh node; None: infinite.
+        precision : {"single", "double"}
+            Of the field.
+        """
+        filled = _options(grid, clamps, parameters, kernel, precision)
+        read = {name: getattr(filled, name) for name in OPTION_NAMES}
+        options = {n: tuple(v) if isinstance(v, ctypes.Array) else v for n, v in read.items()}
+        firm = None if stiffness is None else np.ascontiguousarray(stiffness, dtype=np.float64)
+        return cls(options, np.ascontiguousarray(clamps.points, dtype=np.float64), firm)
+
+
+OPTION_NAMES = tuple(
+    name
+    for name, kind, *_ in core.SceneOptions._fields_
+    if name
+    not in ("struct_size", "reserved", "level", "contact_room", "clamped_point_count", "stiffness_count")
+    and kind is not ctypes.c_void_p
+)
+"""Options that a `CoreScene` may name; level and room are the own matter of a host."""
+
+
+def _struct(options: Mapping[str, Any]) -> core.SceneOptions:
+    """Return the core's struct of options by name."""
+    o = core.SceneOptions(struct_size=ctypes.sizeof(core.SceneOptions))
+    for name, value in options.items():
+        if name not in OPTION_NAMES:
+            raise InputError(f"{name!r} is no option of a scene; expected some of {', '.join(OPTION_NAMES)}")
+        try:
+            if isinstance(getattr(o, name), ctypes.Array):
+                getattr(o, name)[:] = tuple(value)
+            else:
+                setattr(o, name, value)
+        except (TypeError, ValueError, OverflowError):
+            raise InputError(
+                f"option {name} of a scene has another form than the core's; got {value!r}"
+            ) from None
+    return o
+
+
 class NativeStep:
     """Steps of one scene in the core, for any state, from any thread.
 
     Parameters
     ----------
-    grid : RegularGrid or SpatialGrid
-        The mesh, in the plane (D = 2) or in space (D = 3).
-    clamps : Clamps
-        The clamped and sliding edges (faces), and clamped points.
-    parameters : TPSParameters
-        Of the interaction.
-    kernel : Kernel
-        `ThinPlate` or `Elastic`.
-    stiffness : ndarray, shape (n,), or None
-        Per mesh node; None: infinite.
-    precision : {"single", "double"}
-        Of the field.
+    scene : CoreScene
+        What is given.
 
     Raises
     ------
@@ -114,25 +193,18 @@ class NativeStep:
         If the core refuses the scene.
     """
 
-    def __init__(
-        self,
-        grid: RegularGrid | SpatialGrid,
-        clamps: Clamps,
-        parameters: TPSParameters,
-        kernel: Kernel,
-        stiffness: Floats | None,
-        precision: Precision,
-    ) -> None:
+    def __init__(self, scene: CoreScene) -> None:
+        self.scene = scene
         self._core = core.library()
         self._lock = threading.Lock()
-        self._size, self._dimension = grid.size, len(grid.shape)
-        self._lazy = self._dimension == 3 or grid.size > FINE
+        options = _struct(scene.options)
+        self._dimension = options.dimension
+        self._size = prod(options.shape[: options.dimension])
+        self._lazy = self._dimension == 3 or self._size > FINE
         self._current: NativeState | None = None
-        options = _options(grid, clamps, parameters, kernel, precision)
-        points = np.ascontiguousarray(clamps.points, dtype=np.float64)
+        points, firm = scene.clamped_points, scene.stiffness
         options.clamped_points, options.clamped_point_count = points.ctypes.data, len(points)
-        if stiffness is not None:
-            firm = np.ascontiguousarray(stiffness, dtype=np.float64)
+        if firm is not None:
             options.stiffness, options.stiffness_count = firm.ctypes.data, len(firm)
         self._scene, self._tissue = ctypes.c_void_p(), ctypes.c_void_p()
         status = self._core.echospline_scene_create(ctypes.byref(options), ctypes.byref(self._scene))

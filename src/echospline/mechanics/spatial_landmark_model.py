@@ -18,7 +18,7 @@ from echospline.mechanics.forces import check_step
 from echospline.mechanics.kernels import Elastic, Kernel, ThinPlate
 from echospline.mechanics.landmark_stiffness import landmark_stiffness
 from echospline.mechanics.landmarks import Clamps, contact_lattice, join_gap, strides
-from echospline.mechanics.native import NativeState, NativeStep, Precision
+from echospline.mechanics.native import CoreScene, NativeState, NativeStep, Precision
 from echospline.mechanics.parameters import TPSParameters
 from echospline.mechanics.reference import Reference
 from echospline.mechanics.tps import anchors_for
@@ -110,7 +110,9 @@ class SpatialLandmarkModel:
         if not self.tissue.homogeneous:
             self.stiffness = landmark_stiffness(self.tissue, grid, self.kernel, self.anchors)
         self.precision: Precision = precision
-        self.native = NativeStep(grid, self.clamps, self.parameters, self.kernel, self.stiffness, precision)
+        self.native = NativeStep(
+            CoreScene.of(grid, self.clamps, self.parameters, self.kernel, self.stiffness, precision)
+        )
 
     def __reduce__(self) -> tuple[partial[SpatialLandmarkModel], tuple[object, ...]]:
         """Pickle what the model was made of; a copy has a workspace of its own."""

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from echospline.errors import InputError
 from echospline.mechanics.kernels import Elastic, Kernel, ThinPlate
 from echospline.mechanics.landmarks import Anchors, Clamps, contact_lattice, join_gap
-from echospline.mechanics.native import NativeState, NativeStep, Precision
+from echospline.mechanics.native import CoreScene, NativeState, NativeStep, Precision
 from echospline.mechanics.parameters import TPSParameters
 from echospline.mechanics.reference import Reference, TPSState
 from echospline.mechanics.spline import Spline, condition
@@ -130,7 +130,7 @@ class TPSModel:
         self.native: NativeStep | None = None
         if solver == "response":
             self.native = NativeStep(
-                grid, self.clamps, self.parameters, self.kernel, self.stiffness, precision
+                CoreScene.of(grid, self.clamps, self.parameters, self.kernel, self.stiffness, precision)
             )
 
     def __reduce__(self) -> tuple[partial[TPSModel], tuple[object, ...]]:

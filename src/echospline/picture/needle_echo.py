@@ -157,6 +157,16 @@ class NeedleEcho:
         """Outer diameter, mm."""
         return OUTER_DIAMETER[self.gauge]
 
+    def named(self) -> dict[str, int | float | list[float]]:
+        """Return these looks as members of `echospline_needle` by their names, without a place: as every host gives them to the core."""
+        needle = self.between((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        read = {name: getattr(needle, name) for name, *_ in core.Needle._fields_}
+        return {
+            name: list(value) if isinstance(value, ctypes.Array) else value
+            for name, value in read.items()
+            if name not in ("struct_size", "entry", "tip")
+        }
+
     def fainter(self, share: float) -> NeedleEcho:
         """Return the looks of a needle whose echo has ``share`` of the amplitude, above 0 to 1."""
         loss = 20 * log10(share)

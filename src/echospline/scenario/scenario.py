@@ -17,6 +17,7 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 from echospline.atomic import appearing
 from echospline.errors import InputError
 from echospline.picture import NeedleEcho
+from echospline.scenario.body_section import BodySection, bodies_of, body_regions
 from echospline.scenario.messages import describe as _describe
 from echospline.scenario.messages import sentence, shown
 from echospline.scenario.phantom_section import PhantomSection, ProbeSection
@@ -75,6 +76,9 @@ class Scenario(Section):
     probe: ProbeSection = Field(default_factory=ProbeSection)
     phantom: PhantomSection = Field(default_factory=PhantomSection)
     space: SpaceSection | None = Field(None, description="a scene in space: the image is a volume")
+    body: list[BodySection] = Field(
+        default=[], description="lesions and vessels that the picture shows, each on top of those before"
+    )
     exercise: list[ExerciseSection] = Field(default=[], description="what can be trained live")
 
     @model_validator(mode="before")
@@ -152,8 +156,32 @@ class Scenario(Section):
         Raises
         ------
         InputError
-            If the file cannot be read, is a volume and no slice is named, or has a size that no ultrasound picture has.
+            If the file cannot be read, is a volume and no slice is named, or has a size that no ultrasound picture has, or
+            a body cannot be imaged into it.
         """
+        bodies = bodies_of(self.body, self.exercise) if self.has_bodies else []
+        scenario, image = self._recorded(folder, eight_bit=True if bodies else eight_bit)
+        if bodies:
+            from echospline.laboratory import imaged  # noqa: PLC0415  (as below)
+
+            image = imaged(
+                image,
+                bodies,
+                display=self.phantom.display(),
+                apex=self.needle.echo.apex,
+                seed=self.phantom.seed,
+            )
+        return scenario, image
+
+    @property
+    def has_bodies(self) -> bool:
+        """Whether the picture is to show lesions or vessels that were not recorded."""
+        return bool(self.body) or any(
+            disc.shown for exercise in self.exercise for disc in (exercise.target, *exercise.vessels)
+        )
+
+    def _recorded(self, folder: Path, *, eight_bit: bool | None) -> tuple[Scenario, UltrasoundImage]:
+        """Read the picture as it was recorded."""
         section = self.image
         if section.file == PHANTOM:
             image = self.phantom.still(self.probe.probe())
@@ -226,6 +254,7 @@ class Scenario(Section):
             Region(_shape(r, folder, mesh, f"tissue.region[{i}]"), r.young, r.poisson, r.name)
             for i, r in enumerate(t.region)
         ]
+        regions += body_regions(self.body, self.exercise)
         return Tissue(t.young, t.poisson, regions, t.thickness, t.plane)
 
     def save(self, path: Path, folder: Path) -> None:

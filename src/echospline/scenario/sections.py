@@ -41,6 +41,8 @@ PerLength = Annotated[float, _in_unit("N/mm")]
 PerArea = Annotated[float, _in_unit("N/mm^2")]
 Kilopascals = Annotated[float, _in_unit("kPa")]
 Point = tuple[Millimetres, Millimetres]
+Place = Point | tuple[Millimetres, Millimetres, Millimetres]
+"""Of the plane, or in space."""
 
 
 class Section(BaseModel):
@@ -402,11 +404,28 @@ class OutputSection(Section):
         return self
 
 
-class DiscSection(Section):
-    """A round structure; it moves with the tissue."""
+EchoKind = Literal["hypoechoic", "anechoic", "hyperechoic"]
 
-    centre: Point = Field(description="where it lies at rest (x lateral, y depth), mm")
+
+class DiscSection(Section):
+    """A round structure, in space a ball; it moves with the tissue."""
+
+    centre: Place = Field(description="where it lies at rest (x lateral, y depth, in space z elevation), mm")
     radius: Millimetres = Field(gt=0, le=100, description="mm")
+    imaged: bool = Field(
+        False, description="the picture shows it as a scanner would: a target hypoechoic, a vessel anechoic"
+    )
+    echo: EchoKind | None = Field(
+        None, description="imaged with this echo: hypoechoic, anechoic or hyperechoic"
+    )
+    young: Kilopascals | None = Field(
+        None, gt=0, description="Young's modulus, kPa, where it is stiffer or softer than the tissue"
+    )
+
+    @property
+    def shown(self) -> bool:
+        """Whether the picture itself shows it."""
+        return self.imaged or self.echo is not None
 
 
 class ExerciseSection(Section):
@@ -422,9 +441,35 @@ class ExerciseSection(Section):
     )
     vessels: list[DiscSection] = Field(default=[], max_length=20, description="what the needle may not touch")
     most_redirections: int | None = Field(None, ge=0, description="turns inside the tissue that are allowed")
-    time_limit: Seconds = Field(120.0, gt=0, le=1800, description="the recording ends by itself, s")
+    time_limit: Seconds = Field(
+        120.0, gt=0, le=1800, description="the time left is counted down, and the recording ends with it, s"
+    )
+    help: bool = Field(
+        True,
+        description="rings, guide line and readouts may be shown; false: not while the exercise is recorded",
+    )
+    entry: Place | None = Field(
+        None, description="the needle enters here, mm; where not given, the trainee chooses"
+    )
+    entry_between: tuple[Millimetres, Millimetres] | None = Field(
+        None,
+        description="the entry is drawn by lot between these lateral positions, mm, anew in every attempt",
+    )
+    attempts: int | None = Field(
+        None, ge=1, le=1000, description="attempts that a trainee has; any number where not given"
+    )
+
+    @model_validator(mode="after")
+    def _one_entry(self) -> Self:
+        if self.entry is not None and self.entry_between is not None:
+            raise ValueError("an entry is fixed (entry) or drawn by lot (entry_between), not both")
+        if self.entry_between is not None and not self.entry_between[0] < self.entry_between[1]:
+            raise ValueError(
+                f"entry_between = {list(self.entry_between)}: expected two lateral positions in mm, the smaller one first"
+            )
+        return self
 
     @property
-    def landmarks(self) -> list[tuple[float, float]]:
+    def landmarks(self) -> list[Place]:
         """Centres of target and vessels at rest, mm: the points watched while the tissue moves."""
         return [self.target.centre, *(vessel.centre for vessel in self.vessels)]

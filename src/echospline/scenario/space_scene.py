@@ -9,6 +9,7 @@ import numpy as np
 
 from echospline.errors import InputError
 from echospline.picture.slices import SliceFormer
+from echospline.scenario.body_section import bodies_of, body_regions
 from echospline.scenario.scenario import Scenario
 from echospline.scenario.sections import TissueSection
 from echospline.scenario.space_former import former_notes, former_of
@@ -55,7 +56,7 @@ def open_spatial(scenario: Scenario, folder: Path) -> SpatialScene:
     Raises
     ------
     InputError
-        If it cannot be read or is no volume, or a region of the tissue is one of the plane.
+        If it cannot be read or is no volume, a region of the tissue is one of the plane, or a body cannot be imaged into it.
     """
     space = scenario.space or SpaceSection()
     name = scenario.image.file
@@ -83,6 +84,11 @@ def open_spatial(scenario: Scenario, folder: Path) -> SpatialScene:
     notes += said
     own = _takes_own(scenario, space, known=made is not None)
     space = space.model_copy(update={"tissue": "own" if own else "homogeneous"})
+    if scenario.has_bodies:
+        from echospline.laboratory import imaged_volume  # noqa: PLC0415
+
+        bodies = bodies_of(scenario.body, scenario.exercise)
+        volume = imaged_volume(volume, bodies, display=scenario.phantom.display(), seed=scenario.phantom.seed)
     resolved = scenario.model_copy(update={"space": space})
     tissue = spatial_tissue(scenario)
     if own and made is not None:
@@ -131,7 +137,7 @@ def _takes_own(scenario: Scenario, space: SpaceSection, *, known: bool) -> bool:
 
 
 def spatial_tissue(scenario: Scenario) -> Tissue:
-    """Build the tissue of a scenario's words in space: homogeneous, or with layers by depth.
+    """Build the tissue of a scenario's words in space: homogeneous, or with layers by depth and bodies.
 
     Raises
     ------
@@ -147,6 +153,7 @@ def spatial_tissue(scenario: Scenario) -> Tissue:
                 "and labels build the model in Python"
             )
         regions.append(Region(Layer(*region.layer), region.young, region.poisson, region.name))
+    regions += body_regions(scenario.body, scenario.exercise)
     return Tissue(t.young, t.poisson, regions, t.thickness)
 
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import threading
+import time
 from collections.abc import Callable
 from typing import Any, TypeVar
 
 T = TypeVar("T")
+_running: set[threading.Thread] = set()
 
 
 async def aside(function: Callable[..., T], *arguments: object) -> T:
@@ -37,9 +39,24 @@ async def aside(function: Callable[..., T], *arguments: object) -> T:
             loop.call_soon_threadsafe(settle, result, error)
         except RuntimeError:  # the loop has ended meanwhile
             return
+        finally:
+            _running.discard(threading.current_thread())
 
-    threading.Thread(target=run, name="echospline-aside", daemon=True).start()
+    thread = threading.Thread(target=run, name="echospline-aside", daemon=True)
+    _running.add(thread)
+    thread.start()
     return await done
+
+
+def unfinished(patience: float) -> bool:
+    """Wait up to ``patience`` seconds for every call of `aside`; returns whether one goes on nevertheless.
+
+    The interpreter cannot end safely while one does: it takes away what native code is using.
+    """
+    until = time.monotonic() + patience
+    for thread in list(_running):
+        thread.join(max(0.0, until - time.monotonic()))
+    return any(thread.is_alive() for thread in list(_running))
 
 
 class Ending:

@@ -6,6 +6,7 @@ import hmac
 import logging
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
@@ -21,17 +22,14 @@ SUBPROTOCOL = "echospline.1"
 """Offered by the page; a token is sent with it as ``token.<token>``, because a page cannot set headers there."""
 
 SECURITY_HEADERS = {
-    "Content-Security-Policy": (
-        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
-        "manifest-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-    ),
+    "Content-Security-Policy": "default-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "no-cache",
 }
-PUBLIC = ("/static/", "/favicon.ico")
+PUBLIC = frozenset({"/", "/core.wasm", "/phone", "/favicon.ico"})
 """Paths without secrets: the page itself must load before it can present its token."""
 
 
@@ -47,16 +45,20 @@ class Guard:
         The guarded application.
     hosts : frozenset of str, or None
         Host names that are accepted (without port); None accepts any and relies on the token.
-    token : str or None
-        Token that a client must present, if any.
+    tokens : tuple of str
+        Tokens of which a client must present one; none where everyone may come in.
     origins : tuple of str
         Origins of reverse proxies, from `checked_origin`: their pages are this server's, whatever Host the proxy sends on.
     """
 
     def __init__(
-        self, app: ASGIApp, hosts: frozenset[str] | None, token: str | None, origins: tuple[str, ...] = ()
+        self,
+        app: ASGIApp,
+        hosts: frozenset[str] | None,
+        tokens: tuple[str, ...] = (),
+        origins: tuple[str, ...] = (),
     ) -> None:
-        self.app, self.hosts, self.token, self.origins = app, hosts, token, frozenset(origins)
+        self.app, self.hosts, self.tokens, self.origins = app, hosts, tokens, frozenset(origins)
         self._refused: set[str] = set()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -76,7 +78,7 @@ class Guard:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
                 for name, value in SECURITY_HEADERS.items():
-                    headers[name] = value
+                    headers.setdefault(name, value)  # a page brings the policy of its own script
             await send(message)
 
         await self.app(scope, receive, send_with_headers)
@@ -93,11 +95,11 @@ class Guard:
         if len(origins) > 1 or (origins and not self._is_own(origins[0], hosts[0])):
             self._log_refused(origins[0])
             return 403, "pages of another origin may not connect"
-        secret = scope["type"] == "websocket" or not (
-            scope["path"] == "/" or any(scope["path"].startswith(path) for path in PUBLIC)
-        )
-        if self.token is not None and secret and not self._token_matches(headers):
-            return 401, "the token is missing or wrong: open the address that the server printed"
+        secret = scope["type"] == "websocket" or scope["path"] not in PUBLIC
+        if self.tokens and secret:
+            given = tokens_of(headers)
+            if not any(given.hold(token) for token in self.tokens):
+                return 401, "the token is missing or wrong: open the address that the server printed"
         return None
 
     def _is_own(self, origin: str, host: str) -> bool:
@@ -115,14 +117,26 @@ class Guard:
                 origin,
             )
 
-    def _token_matches(self, headers: Headers) -> bool:
-        assert self.token is not None  # checked by the caller
-        offered = [part.strip() for part in headers.get("sec-websocket-protocol", "").split(",")]
-        given = [part.removeprefix("token.") for part in offered if part.startswith("token.")]
-        scheme, _, bearer = headers.get("authorization", "").partition(" ")
-        if scheme.lower() == "bearer":
-            given.append(bearer)
-        return any(hmac.compare_digest(self.token.encode(), value.encode()) for value in given)
+
+@dataclass(frozen=True)
+class Tokens:
+    """Tokens that a client presents."""
+
+    given: tuple[str, ...]
+
+    def hold(self, secret: str) -> bool:
+        """Test whether one is this, in a time that does not tell how much of it is right."""
+        return any(hmac.compare_digest(secret.encode(), value.encode()) for value in self.given)
+
+
+def tokens_of(headers: Headers) -> Tokens:
+    """Return the tokens of a request: those among its web socket's subprotocols, and its bearer."""
+    offered = [part.strip() for part in headers.get("sec-websocket-protocol", "").split(",")]
+    given = [part.removeprefix("token.") for part in offered if part.startswith("token.")]
+    scheme, _, bearer = headers.get("authorization", "").partition(" ")
+    if scheme.lower() == "bearer":
+        given.append(bearer)
+    return Tokens(tuple(given))
 
 
 def checked_origin(text: str) -> str:

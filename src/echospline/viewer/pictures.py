@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import re
 import secrets
+import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -27,7 +28,7 @@ class Picture:
     Parameters
     ----------
     name : str
-        Of its scene: 16 hexadecimal digits that follow from content and spacing.
+        Of its scene: the first 16 digits of its pack's SHA-256, hexadecimal.
     path : Path
         The stored file.
     spacing : (lateral, depth) or None
@@ -50,6 +51,8 @@ class Pictures:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        self._held: Counter[Path] = Counter()
+        self._lock = threading.RLock()
 
     def part(self) -> Path:
         """Return the path of a new file to receive into.
@@ -65,8 +68,8 @@ class Pictures:
             raise InputError(f"uploads cannot be stored here ({error.strerror})") from error
         return self.folder / f"receiving-{secrets.token_hex(8)}"
 
-    def keep(self, part: Path, digest: str, suffix: str, spacing: tuple[float, float] | None) -> Picture:
-        """Give a received file its name, and record its spacing.
+    def keep(self, part: Path, digest: str, suffix: str) -> Path:
+        """Give a received file its name, and hold it until it is released.
 
         Parameters
         ----------
@@ -76,16 +79,27 @@ class Pictures:
             SHA-256 of the content, hexadecimal.
         suffix : str
             Ending of the file's name, with its dot.
-        spacing : (lateral, depth) or None
-            mm.
         """
-        name = hashlib.sha256(f"{digest} {spacing}".encode()).hexdigest()[:16]
         path = self.folder / f"{digest[:32]}{suffix}"
-        part.replace(path)
+        with self._lock:
+            self._held[path] += 1
+            part.replace(path)
+        return path
+
+    def record(self, name: str, path: Path, spacing: tuple[float, float] | None) -> Picture:
+        """Record that a file, as it was opened with a spacing, is the scene of this name."""
         record = self.part()
         record.write_text(json.dumps({"file": path.name, "spacing": spacing}), encoding="utf-8")
         record.replace(self._record(name))
         return Picture(name, path, spacing)
+
+    def release(self, path: Path) -> None:
+        """End a hold; a file that no scene shows is deleted."""
+        with self._lock, suppress(OSError):
+            self._held[path] -= 1
+            if self._held[path] <= 0:
+                del self._held[path]
+                self._delete_unshown(path)
 
     def find(self, name: str) -> Picture | None:
         """Return the picture of a scene, if it is stored."""
@@ -103,10 +117,22 @@ class Pictures:
     def drop(self, name: str) -> None:
         """Forget a scene, and delete its file unless another scene shows it."""
         picture = self.find(name)
-        with suppress(OSError):
+        with self._lock, suppress(OSError):
             self._record(name).unlink(missing_ok=True)
-            if picture is not None and picture.path not in {p.path for p in self._all()}:
-                picture.path.unlink(missing_ok=True)
+            if picture is not None and picture.path not in self._held:
+                self._delete_unshown(picture.path)
+
+    def _delete_unshown(self, path: Path) -> None:
+        if path not in {picture.path for picture in self._all()}:
+            path.unlink(missing_ok=True)
+
+    def prune(self, needed: Callable[[str], bool], most: int) -> None:
+        """Delete the oldest pictures that nothing needs, beyond so many."""
+        with suppress(OSError):
+            unused = [picture.name for picture in self._all() if not needed(picture.name)]
+            unused.sort(key=lambda name: self._record(name).stat().st_mtime)
+            for name in unused[: max(0, len(unused) - most)]:
+                self.drop(name)
 
     def sweep(self, needed: Callable[[str], bool], now: float | None = None) -> None:
         """Delete old files that nothing needs.
@@ -123,8 +149,9 @@ class Pictures:
             for picture in self._all():
                 if now - picture.path.stat().st_mtime > KEPT_UNUSED and not needed(picture.name):
                     self.drop(picture.name)
-            for part in self.folder.glob("receiving-*"):
-                if now - part.stat().st_mtime > KEPT_UNUSED:
+            shown = {picture.path for picture in self._all()}
+            for part in self.folder.glob("*"):
+                if part not in shown and part.suffix != ".json" and now - part.stat().st_mtime > KEPT_UNUSED:
                     part.unlink(missing_ok=True)
 
     def _all(self) -> list[Picture]:

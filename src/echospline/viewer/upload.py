@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,12 +62,19 @@ class UploadLimits:
     reading: float = 60.0
 
 
-class Uploads:
-    """Who is uploading now."""
+class Turns:
+    """Who is being served now: each client once at a time.
 
-    def __init__(self, limits: UploadLimits) -> None:
-        self.limits = limits
-        self.ending = Ending()
+    Parameters
+    ----------
+    what : str
+        What is served, for messages.
+    at_once : int
+        Clients at a time.
+    """
+
+    def __init__(self, what: str, at_once: int) -> None:
+        self._what, self._at_once = what, at_once
         self._busy: set[str] = set()
 
     @contextmanager
@@ -77,17 +84,26 @@ class Uploads:
         Raises
         ------
         UploadError
-            If the client, or too many clients, are uploading already.
+            If the client, or too many clients, are being served already.
         """
         if client in self._busy:
-            raise UploadError(429, "your last file is still being read: try again in a moment")
-        if len(self._busy) >= self.limits.at_once:
-            raise UploadError(503, f"{len(self._busy)} files are being read: try again in a moment")
+            raise UploadError(429, f"{self._what}: your last one is not done: try again in a moment")
+        if len(self._busy) >= self._at_once:
+            raise UploadError(503, f"{self._what}: {len(self._busy)} are under way: try again in a moment")
         self._busy.add(client)
         try:
             yield
         finally:
             self._busy.discard(client)
+
+
+class Uploads(Turns):
+    """Who is uploading now."""
+
+    def __init__(self, limits: UploadLimits) -> None:
+        super().__init__("files", limits.at_once)
+        self.limits = limits
+        self.ending = Ending()
 
     async def receive(self, request: Request, path: Path) -> str:
         """Write the body of a request to a file; returns its SHA-256, hexadecimal.
@@ -97,42 +113,69 @@ class Uploads:
         UploadError
             If it is too large, too slow, or ends early.
         """
-        limits, clock = self.limits, asyncio.get_running_loop().time
-        too_large = UploadError(413, f"a file has at most {limits.size // 2**20} MiB")
-        announced = request.headers.get("content-length", "")
-        if announced.isdigit() and int(announced[:20]) > limits.size:
-            raise too_large
-        digest, size, start = hashlib.sha256(), 0, clock()
-        chunks = aiter(request.stream())
+        digest = hashlib.sha256()
         with path.open("wb") as file:
-            while True:
-                left = max(0.0, start + limits.deadline - clock())
-                coming = asyncio.ensure_future(anext(chunks, b""))
-                if not await self.ending.first(coming, min(limits.stall, left)):
-                    coming.cancel()
-                    if self.ending.begun:
-                        raise ended()
-                    raise UploadError(
-                        408, f"the file came too slowly: {size} bytes in {clock() - start:.0f} s; try again"
-                    )
-                try:
-                    chunk = coming.result()
-                except ClientDisconnect:
-                    raise UploadError(400, "the connection ended before the file did") from None
-                if not chunk:  # the stream ends with an empty piece
-                    return digest.hexdigest()
-                size += len(chunk)
-                if size > limits.size:
-                    raise too_large
-                late = clock() - start - limits.grace
-                if size < limits.floor * late:
-                    raise UploadError(
-                        408,
-                        f"the file came too slowly: expected {limits.floor / 1024:.0f} KiB/s or more; "
-                        f"got {size / (clock() - start) / 1024:.1f}",
-                    )
-                digest.update(chunk)
-                file.write(chunk)
+            async for piece in self.pieces(request, self.limits.size):
+                digest.update(piece)
+                file.write(piece)
+        return digest.hexdigest()
+
+    async def body(self, request: Request, most: int) -> bytes:
+        """Return the body of a request of at most this many bytes.
+
+        Raises
+        ------
+        UploadError
+            If it is too large, too slow, or ends early.
+        """
+        data = bytearray()
+        async for piece in self.pieces(request, most):
+            data += piece
+        return bytes(data)
+
+    async def pieces(self, request: Request, most: int) -> AsyncIterator[bytes]:
+        """Receive the body of a request, of at most this many bytes, piece by piece.
+
+        Raises
+        ------
+        UploadError
+            If it is too large, too slow, or ends early.
+        """
+        limits, clock = self.limits, asyncio.get_running_loop().time
+        size_ = f"{most // 2**20} MiB" if most >= 2**20 else f"{most} bytes"
+        too_large = UploadError(413, f"what is sent here has at most {size_}")
+        announced = request.headers.get("content-length", "")
+        if announced.isdigit() and int(announced[:20]) > most:
+            raise too_large
+        size, start = 0, clock()
+        chunks = aiter(request.stream())
+        while True:
+            left = max(0.0, start + limits.deadline - clock())
+            coming = asyncio.ensure_future(anext(chunks, b""))
+            if not await self.ending.first(coming, min(limits.stall, left)):
+                coming.cancel()
+                if self.ending.begun:
+                    raise ended()
+                raise UploadError(
+                    408, f"the file came too slowly: {size} bytes in {clock() - start:.0f} s; try again"
+                )
+            try:
+                chunk = coming.result()
+            except ClientDisconnect:
+                raise UploadError(400, "the connection ended before the file did") from None
+            if not chunk:  # the stream ends with an empty piece
+                return
+            size += len(chunk)
+            if size > most:
+                raise too_large
+            late = clock() - start - limits.grace
+            if size < limits.floor * late:
+                raise UploadError(
+                    408,
+                    f"the file came too slowly: expected {limits.floor / 1024:.0f} KiB/s or more; "
+                    f"got {size / (clock() - start) / 1024:.1f}",
+                )
+            yield chunk
 
 
 def ended() -> UploadError:
