@@ -230,7 +230,9 @@ def sources() -> list[Path]:
 def functions() -> list[str]:
     """Names of the C interface's functions, in the headers' order."""
     folder = ROOT / "core" / "include" / "echospline"
-    text = "".join((folder / name).read_text(encoding="utf-8") for name in ("echospline.h", "green.h", "space.h"))
+    text = "".join(
+        (folder / name).read_text(encoding="utf-8") for name in ("echospline.h", "green.h", "space.h")
+    )
     return re.findall(r"^ECHOSPLINE_API[^;(]*?\b(echospline_\w+)\(", text, flags=re.MULTILINE)
 
 

@@ -6,6 +6,7 @@ import http.client
 import json
 import socket
 import threading
+import time
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -116,3 +117,11 @@ def listening(address, key="", **options):
     """A page that listens at /poses."""
     with connect(f"ws{address[4:]}/poses?room={key}", compression=None, **options) as line:
         yield Page(line)
+
+
+def waited(app, count):
+    """Wait until so many pages listen."""
+    until = time.monotonic() + 10
+    while len(app.state.room.hub.listeners) != count:
+        assert time.monotonic() < until
+        time.sleep(0.01)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import json
 import os
+import pickle
 import re
 import shutil
 import subprocess
@@ -84,6 +85,15 @@ def test_a_session_without_the_host_is_the_references(name):
     assert attached.load().tip == pytest.approx(state.load.tip, abs=1e-7)
 
 
+@pytest.mark.parametrize("name", ["lesion", "polygon"])
+def test_a_response_pickles_after_use(name):
+    response = made(name)
+    expected = response.answer(PLACES, cases(1), POINTS)
+    copy = pickle.loads(pickle.dumps(response))
+    for found, true in zip(copy.answer(PLACES, cases(1), POINTS), expected, strict=True):
+        np.testing.assert_array_equal(found, true)
+
+
 @pytest.mark.parametrize("name", ["sliding top", "polygon"])
 def test_a_saved_state_goes_on_in_another_tissue(name):
     tables = made(name).tables()
@@ -135,6 +145,14 @@ WRONG = {
     "a point outside": ("clamped points", {"pins": np.array([[50.0, 3.0]])}, "pins must lie in the tissue"),
     "lines": ("polygon", {"lines_x": np.array([0.0, 3.0, 2.0, 40.0])}, "must ascend"),
     "fewer moduli": ("polygon", {"moduli": np.ones((4, 2))}, "triangles"),
+    "more than is factored in time": (
+        "layer and lesion",
+        {
+            "conditions": np.tile([20.0, 0.0, 0.0, -1.0], (60_000, 1)),
+            "sides": np.tile([0, 0, -1], (60_000, 1)),
+        },
+        "for they are factored",
+    ),
     "fewer sides": ("lesion", {"sides": np.zeros((4, 3), dtype=np.int32)}, "sides of green must have"),
     "fewer source counts": ("lesion", {"source_counts": np.array([9])}, "source_counts of green must have"),
     "half an entry": ("lesion", {"sources": np.ones(7)}, "2 per entry"),

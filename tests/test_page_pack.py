@@ -306,12 +306,16 @@ def test_the_one_script_is_sound_javascript(tmp_path):
     assert done.returncode == 0, done.stderr
 
 
+@pytest.fixture(scope="session")
+def browser_type_launch_args(browser_type_launch_args):
+    flags = ["--no-sandbox", "--disable-gpu"]
+    return {**browser_type_launch_args, "executable_path": CHROMIUM, "args": flags}
+
+
 @pytest.mark.skipif(
     CHROMIUM is None, reason="Chromium is not installed; run tests/install-system (needs apt-get and root)"
 )
-def test_a_page_opens_from_a_file_and_runs_nothing_that_was_added(small, tmp_path):
-    from playwright.sync_api import sync_playwright  # noqa: PLC0415 - only where a browser is
-
+def test_a_page_opens_from_a_file_and_runs_nothing_that_was_added(small, tmp_path, browser):
     wasm = page_scene.ROOT / "src" / "echospline" / "_native" / "echospline.wasm"
     if not wasm.exists():
         pytest.skip("echospline.wasm is not built; run make wasm")
@@ -335,20 +339,18 @@ def test_a_page_opens_from_a_file_and_runs_nothing_that_was_added(small, tmp_pat
         f"<img src='{there}/leak.png'><iframe src='{there}/frame'></iframe><form action='{there}/form'></form></body>"
     )
     (tmp_path / "page.html").write_text(page.replace("</body>", added), encoding="utf-8", newline="")
-    with sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
-        tab = browser.new_page()
-        tab.goto((tmp_path / "page.html").as_uri())
-        said = tab.locator("#said", has_text="scene of")
-        said.wait_for(timeout=20_000)
-        assert said.inner_text() == f"core 0.1.0, scene of {len(small.to_bytes())} bytes"
-        sent = "fetch(%r).then(() => 'sent', () => 'refused')" % f"{there}/fetch"  # noqa: UP031 - braces are the script's
-        assert tab.evaluate(sent) == "refused"
-        assert tab.title() == "echospline"
-        tab.evaluate("document.querySelector('form').submit()")
-        tab.wait_for_timeout(300)
-        tab.goto(f"{there}/heard")  # the listener does listen
-        browser.close()
+    tab = browser.new_page()
+    tab.goto((tmp_path / "page.html").as_uri())
+    said = tab.locator("#said", has_text="scene of")
+    said.wait_for(timeout=20_000)
+    assert said.inner_text() == f"core 0.1.0, scene of {len(small.to_bytes())} bytes"
+    sent = "fetch(%r).then(() => 'sent', () => 'refused')" % f"{there}/fetch"  # noqa: UP031 - braces are the script's
+    assert tab.evaluate(sent) == "refused"
+    assert tab.title() == "echospline"
+    tab.evaluate("document.querySelector('form').submit()")
+    tab.wait_for_timeout(300)
+    tab.goto(f"{there}/heard")  # the listener does listen
+    tab.close()
     server.shutdown()
     server.server_close()
     assert [path for path in heard if path != "/favicon.ico"] == ["/heard"]

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import base64
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 import page_scene
 from echospline.errors import EchosplineError, InputError
-from echospline.page import Pack, packed_space
+from echospline.live import Trace
+from echospline.page import Exercise, Pack, packed_space, parsed_sessions, score, verify
+from echospline.page.pack import ProbePart
+from echospline.page.probe import in_picture
 from echospline.page.replay import tissue_of
 from echospline.scenario import Scenario, SpatialScene
 from echospline.scenario.space_models import build_spatial_model
 from echospline.scenario.space_scene import spatial_tissue
-from echospline.scene import NeedlePose, SpatialPose, Volume, probe_plane
+from echospline.scene import NeedlePose, Probe, SpatialPose, Volume, probe_plane
 from test_page_pack import changed, put
 
 RNG = np.random.default_rng(9)
@@ -109,7 +117,9 @@ HOSTILE = {
     "a law that is none": (put("models", 0, "options", "source_count", 10**9), "options of a forced tissue"),
     "a table under another name": (put("models", 0, "arrays", {"sources": "green.answers", "conditions": "green.sources", "condition_faces": "green.condition_faces", "answers": "green.conditions"}), "fit"),
     "needle in the plane": (put("needle", "entry", [0.0, 0.0]), "3 numbers"),
-    "exercises": (put("exercises", [page_scene.EXERCISE.model_dump(mode="json")]), "no exercises"),
+    "an exercise of the plane": (put("exercises", [page_scene.EXERCISE.model_dump(mode="json")]), "must lie in the image"),
+    "a target outside": (put("exercises", 0, "target", "centre", [0.0, 5.0, 99.0]), "z from -8 to 7.5"),
+    "an entry by lot": (put("exercises", 0, "entry_between", [1.0, 2.0]), "in the plane alone"),
 }  # fmt: skip
 
 
@@ -197,3 +207,119 @@ def test_the_shipped_spine_is_packed(tmp_path):
     whole = packed_space(open_spatial(scenario, Path()))
     assert [model.name for model in whole.manifest.models][0] == "green"
     assert run(whole) == ""
+
+
+# --- sessions in space
+
+
+def rows_in(pack, seconds=2.0):
+    """In and out again along the pack's own needle."""
+    rate, (entry, way) = (
+        pack.manifest.rate,
+        (np.array(pack.manifest.needle.entry), np.array(pack.manifest.needle.direction)),
+    )
+    times = np.arange(1, round(seconds * rate) + 1) / rate
+    depth = 5.0 * (1 - np.cos(np.pi * times / seconds * 1.4))
+    speed = np.diff(depth, prepend=0.0) * rate
+    return np.column_stack([np.tile(entry, (len(times), 1)), entry + depth[:, None] * way, speed])
+
+
+def told(pack, rows, planes=None, **more):
+    """A session in space as its page records it."""
+    given = page_scene.session(pack, rows, "green", planes=planes, attempt=1, **more)
+    (session,) = parsed_sessions(json.dumps(given).encode(), "test")
+    return {**given, "score": verify(pack, session).score.to_dict()}
+
+
+def checked(pack, given):
+    (session,) = parsed_sessions(json.dumps(given).encode(), "test")
+    return verify(pack, session)
+
+
+def base64_of(rows):
+    return base64.b64encode(np.array(rows, dtype="<f8").tobytes()).decode()
+
+
+def test_a_session_in_space_is_verified_and_a_flattering_one_is_not(pack):
+    rows = rows_in(pack)
+    still = [0, *pack.manifest.probe.pose]
+    aside = [120, 0.0, 0.0, 6.0, 20.0, 0.0, 0.0]  # from then on the needle is out of the picture
+    honest = told(pack, rows, base64_of([still, aside]))
+    found = checked(pack, honest)
+    assert found.differences == ()
+    assert found.trace.dimension == 3
+    assert np.abs(found.trace.watched - np.array(pack.manifest.exercises[0].landmarks)).max() > 1e-3
+    watching = told(pack, rows, base64_of([still]))["score"]["picture_time"]
+    assert 0 < honest["score"]["picture_time"] < watching
+    lie = {**honest, "score": {**honest["score"], "picture_time": watching}}
+    assert "picture_time" in " ".join(checked(pack, lie).differences)
+    quick = told(pack, rows[::3], steps=len(rows[::3]))
+    assert any("speed" in said or "jumps" in said for said in checked(pack, quick).differences)
+
+
+@pytest.mark.parametrize(
+    "planes",
+    [[[1, 0, 0, 0, 0, 0, 0]], [[0] * 7, [0] * 7], [[0] * 7, [1e6, 0, 0, 0, 0, 0, 0]], [[0.5] + [0] * 6]],
+)
+def test_planes_that_make_no_sense_are_refused(pack, planes):
+    rows = rows_in(pack)
+    given = page_scene.session(pack, rows, "green", planes=base64_of(planes))
+    with pytest.raises(InputError, match="planes of a session"):
+        checked(pack, given)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_a_motion_of_the_plane_scores_the_same_wherever_its_plane_lies_in_space(seed):
+    """Every metric is one of space: a planar session, turned and moved anywhere, keeps them all."""
+    rng = np.random.default_rng(seed)
+    n = 400
+    turns = np.repeat(rng.normal(0, 4, 8), n // 8)
+    angle = np.radians(80 + np.cumsum(np.convolve(turns, np.ones(20) / 20, "same") / 20))
+    depth = np.clip(np.cumsum(rng.normal(0.03, 0.15, n)), 0, None)
+    entry = np.column_stack([10 + 0.001 * np.arange(n), np.zeros(n)])
+    tip = entry + depth[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    watched = rng.normal(0, 0.2, (n, 2, 2)).cumsum(axis=0) * 0.02 + [[12.0, 9.0], [9.0, 4.0]]
+    flat = Exercise.model_validate(
+        {
+            "name": "a",
+            "title": "A",
+            "target": {"centre": (12.0, 9.0), "radius": 2.0},
+            "vessels": [{"centre": (9.0, 4.0), "radius": 1.0}],
+        }
+    )
+    R, shift = Rotation.random(random_state=seed % 2**31).as_matrix()[:, :2], rng.normal(0, 30, 3)
+    deep = flat.model_copy(
+        update={"target": flat.target.model_copy(update={"centre": tuple(R @ flat.target.centre + shift)})}
+    )
+    plane = score(Trace(0.01, np.column_stack([entry, tip, depth]), watched), flat).to_dict()
+    raised = Trace(
+        0.01, np.column_stack([entry @ R.T + shift, tip @ R.T + shift, depth]), watched @ R.T + shift
+    )
+    space = score(raised, deep, np.ones(n, dtype=bool)).to_dict()
+    assert space.pop("picture_time") == pytest.approx(plane["tissue_time"])
+    for name, value in plane.items():
+        assert space[name] == pytest.approx(value, rel=1e-6, abs=1e-6), name
+    again = Trace.from_bytes(raised.to_bytes())
+    np.testing.assert_array_equal(again.poses, raised.poses)
+    np.testing.assert_array_equal(again.watched, raised.watched)
+
+
+@pytest.mark.parametrize("shape", ["linear", "curved"])
+def test_a_tip_is_in_the_picture_where_the_probe_sees_it_and_its_slice_is_thick_enough(shape):
+    probe = Probe(shape, width=30.0, radius=25.0, opening=50.0, depth=28.0, pixel=0.2, elevation=0.6)
+    (columns, rows), grid = probe.grid.shape, probe.grid
+    part = ProbePart(
+        shape=shape, columns=columns, rows=rows, spacing=list(grid.spacing), origin=list(grid.origin), radius=25.0, opening=50.0, depth=28.0,
+        pose=[0] * 6, elevation=0.6, elevation_depth=probe.elevation_depth, element_height=probe.element_height,
+    )  # fmt: skip
+    pose = [3.0, 1.0, -2.0, 35.0, 12.0, -20.0]
+    local = np.column_stack([RNG.uniform(-20, 20, 3000), RNG.uniform(-5, 35, 3000), RNG.uniform(-4, 4, 3000)])
+    plane = probe_plane(pose[:3], *pose[3:])
+    tips = local @ plane.matrix[:3, :3].T + plane.matrix[:3, 3]
+    wanted = probe.sees(local[:, :2]) & (
+        np.abs(local[:, 2]) <= np.maximum(2 * probe.thickness(local[:, 1]), 0.5)
+    )
+    seen = in_picture(part, np.array([[0, *pose]]), tips)
+    assert 100 < wanted.sum() < 2900
+    edge = np.abs(local[:, 0]) > probe.width / 2 - 0.4 if shape == "linear" else np.zeros(3000, bool)
+    np.testing.assert_array_equal(seen[~edge], wanted[~edge])

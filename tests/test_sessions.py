@@ -270,7 +270,7 @@ def test_rules_of_an_exercise_are_checked_on_the_recorded_motion(rows, rules, sa
     ("rules", "said"),
     [
         ({"entry": (8.0, 0.0)}, ""),
-        ({"entry": (9.0, 0.0)}, "entered at 8.00, 0.00 mm; the exercise says 9, 0"),
+        ({"entry": (9.0, 0.0)}, "entered at 8.00, 0.00 mm; the exercise says 9.00, 0.00"),
         ({"entry_between": (4.0, 9.0)}, ""),
         ({"entry_between": (10.0, 12.0)}, "entered at x = 8.00 mm; the exercise draws it from 10 to 12 mm"),
     ],

@@ -109,10 +109,20 @@ def test_webassembly_draws_planes_as_python_does(tmp_path):
 
 
 def test_webassembly_steps_the_law_as_python_does(tmp_path):
-    faces = {"left": "clamped", "right": "clamped", "bottom": "clamped", "front": "sliding", "back": "free", "top": "sliding"}
+    faces = {
+        "left": "clamped",
+        "right": "clamped",
+        "bottom": "clamped",
+        "front": "sliding",
+        "back": "free",
+        "top": "sliding",
+    }
     grid, clamps = block((36.0, 32.0, 30.0), faces)
     response = SpaceResponse(grid, clamps, Tissue(10.0, 0.45), radius=1.5)
-    model, points = SpatialForceModel(response, NeedleForces()), np.array([[-4.0, 7.0, -1.0], [5.0, 3.0, 3.0]])
+    model, points = (
+        SpatialForceModel(response, NeedleForces()),
+        np.array([[-4.0, 7.0, -1.0], [5.0, 3.0, 3.0]]),
+    )
     state, states = model.rest(), []
     for pose in session():
         state = model.advance(state, pose, 0.1)

@@ -69,7 +69,9 @@ def same(a, b, forces=1e-8):
         assert getattr(a.load, name) == pytest.approx(getattr(b.load, name), abs=20 * forces), name
 
 
-@pytest.mark.parametrize("law", [LAW, replace(LAW, viscosity=0.05, dead_band=0.15)], ids=["plain", "viscous, play"])
+@pytest.mark.parametrize(
+    "law", [LAW, replace(LAW, viscosity=0.05, dead_band=0.15)], ids=["plain", "viscous, play"]
+)
 @pytest.mark.parametrize("name", ["free top", "mixed"])
 def test_the_core_solves_the_law_as_numpy_does(name, law):
     models = [SpatialForceModel(response(name), law, solver=solver) for solver in ("native", "reference")]
@@ -87,7 +89,9 @@ def test_finite_elements_answer_the_core_too():
     grid, clamps = block(SIZE, FACES["free top"])
     tissue = Tissue(10.0, 0.45, [Region(Sphere((-3.0, 9.0, 0.0), 4.0), 40.0)])
     made = SpatialFEMResponse(grid, clamps, tissue, cell=6.0, radius=1.5)
-    native, reference = (run(SpatialForceModel(made, LAW, solver=s), session()[:16]) for s in ("native", "reference"))
+    native, reference = (
+        run(SpatialForceModel(made, LAW, solver=s), session()[:16]) for s in ("native", "reference")
+    )
     for a, b in zip(native, reference, strict=True):
         same(a, b)
 
@@ -99,7 +103,9 @@ def test_an_earlier_state_goes_on_as_it_did():
     for k in (20, 3, 12, 29):  # among them one that another track follows
         again = model.advance(states[k], poses[k], 0.1)
         same(again, states[k + 1], 1e-12)
-        assert [a.station.place.tolist() for a in again.track] == [a.station.place.tolist() for a in states[k + 1].track]
+        assert [a.station.place.tolist() for a in again.track] == [
+            a.station.place.tolist() for a in states[k + 1].track
+        ]
 
 
 def test_a_needle_drawn_out_of_a_loaded_state_leaves_its_track():
@@ -108,12 +114,19 @@ def test_a_needle_drawn_out_of_a_loaded_state_leaves_its_track():
     fresh = SpatialForceModel(response("free top"), LAW)
     away = SpatialPose((0, 0, 0), (0, 0, 0))
     out = fresh.advance(states[-1], away, 0.1)
-    assert not out.forces.any() and len(out.track) == len(states[-1].track)
-    same(fresh.advance(out, session()[9], 0.1), model.advance(model.advance(states[-1], away, 0.1), session()[9], 0.1), 1e-12)
+    assert not out.forces.any()
+    assert len(out.track) == len(states[-1].track)
+    same(
+        fresh.advance(out, session()[9], 0.1),
+        model.advance(model.advance(states[-1], away, 0.1), session()[9], 0.1),
+        1e-12,
+    )
 
 
 def test_states_of_another_solver_are_refused():
-    native, reference = (SpatialForceModel(response("free top"), LAW, solver=s) for s in ("native", "reference"))
+    native, reference = (
+        SpatialForceModel(response("free top"), LAW, solver=s) for s in ("native", "reference")
+    )
     with pytest.raises(InputError, match="another solver"):
         native.advance(reference.rest(), session()[0], 0.1)
     with pytest.raises(InputError, match="another solver"):
@@ -134,16 +147,18 @@ class CoreTissue:
         self.kept = []
         for name, value in {**tables, **changed}.items():
             if isinstance(value, np.ndarray) and value.size > 3:
-                array = np.ascontiguousarray(value)
-                self.kept.append(array)
-                value = array.ctypes.data
-            if isinstance(value, np.ndarray):
+                self.kept.append(np.ascontiguousarray(value))
+                setattr(o, name, self.kept[-1].ctypes.data)
+            elif isinstance(value, np.ndarray):
                 getattr(o, name)[:] = value.tolist()
             else:
                 setattr(o, name, value)
         o.source_count, o.condition_count = len(tables["sources"]) // 3, len(tables["condition_faces"])
         o.answer_count = len(tables["answers"])
-        o.source_count, o.answer_count = changed.get("source_count", o.source_count), changed.get("answer_count", o.answer_count)
+        o.source_count, o.answer_count = (
+            changed.get("source_count", o.source_count),
+            changed.get("answer_count", o.answer_count),
+        )
         self.status = self.core.echospline_spatial_create(ctypes.byref(o), ctypes.byref(self.handle))
 
     def __del__(self):
@@ -189,7 +204,9 @@ def test_the_core_answers_from_tables_as_python_does(name):
     most = 0.0
     for state, pose in zip(run(model, session())[1:], session(), strict=True):
         tissue.ok(tissue.advance(pose))
-        np.testing.assert_allclose(tissue.forces(), state.forces, atol=2e-5)  # N; Python's rows are of single precision
+        np.testing.assert_allclose(
+            tissue.forces(), state.forces, atol=2e-5
+        )  # N; Python's rows are of single precision
         u = model.field(state)(points)
         np.testing.assert_allclose(tissue.at(points), u, atol=2e-4)
         most = max(most, np.abs(u).max())
@@ -235,7 +252,8 @@ def test_without_tables_a_station_is_asked_for():
     station = space.SpatialStation()
     tissue.ok(tissue.core.echospline_spatial_wanted(tissue.handle, station))
     np.testing.assert_allclose(np.linalg.norm(station.axis), 1)
-    assert station.index == 0 and sum(station.weights[: station.point_count]) == pytest.approx(1)
+    assert station.index == 0
+    assert sum(station.weights[: station.point_count]) == pytest.approx(1)
     rows = np.zeros(9)
     answer = tissue.core.echospline_spatial_answer
     assert answer(tissue.handle, rows.ctypes.data, 8) == core.Status.WRONG_SIZE
@@ -285,7 +303,10 @@ def test_faces_and_sources_of_the_tables_are_checked():
     tables = response("free top").tables()
     faces, sources = tables["condition_faces"].copy(), tables["sources"].copy()
     faces[3], sources[4] = 4, -1.0
-    for changed, match in (({"condition_faces": faces}, "one bit each"), ({"sources": sources}, "below the surface")):
+    for changed, match in (
+        ({"condition_faces": faces}, "one bit each"),
+        ({"sources": sources}, "below the surface"),
+    ):
         tissue = CoreTissue({**tables, **changed})
         with pytest.raises(InputError, match=match):
             tissue.ok(tissue.status)

@@ -271,17 +271,22 @@ def test_wrong_exercises_are_refused_by_name(tmp_path, old, new, match):
         load(tmp_path / "scenario.toml")
 
 
+def corners(grid):
+    x0, x1, y0, y1 = grid.extent
+    return (x0, y0), (x1, y1)
+
+
 def test_two_exercises_of_one_name_are_refused():
     with pytest.raises(InputError, match="names must differ"):
-        check_exercises([EXERCISE, EXERCISE], MESH)
+        check_exercises([EXERCISE, EXERCISE], *corners(MESH))
 
 
 def test_a_target_outside_the_image_is_refused_and_the_default_ones_fit_any():
     outside = Exercise(name="a", title="A", target=Disc(centre=(99.0, 1.0), radius=1.0))
     with pytest.raises(InputError, match="must lie in the image"):
-        check_exercises([outside], MESH)
+        check_exercises([outside], *corners(MESH))
     for grid in (RegularGrid((5, 90), (3.0, 1.0), (-10.0, 4.0)), MESH):
-        check_exercises(default_exercises(grid), grid)
+        check_exercises(default_exercises(grid), *corners(grid))
 
 
 # --- sessions

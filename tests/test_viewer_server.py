@@ -27,7 +27,7 @@ from echospline.viewer.guard import Allowance, Guard
 from echospline.viewer.reference import MOST_ROWS
 from echospline.viewer.served_files import takes_gzip
 from echospline.viewer.sockets import turn_of
-from live_scene import PAGE_KEY, fem, free_port, get, listening, pack, post, recorded, running, scene
+from live_scene import PAGE_KEY, fem, free_port, get, listening, pack, post, recorded, running, scene, waited
 from page_scene import poses
 
 OTHER_KEY = "cd" * 16
@@ -314,13 +314,6 @@ def test_a_tracker_steers_every_page_and_the_newest_pose_wins(server):
             assert not any(message["appears"] for message in told[1:])
         turn(app, [1, 2, 3, 10, 20, 30])
         assert one.hear("plane")["plane"] == [1, 2, 3, 10, 20, 30]
-
-
-def waited(app, count):
-    until = time.monotonic() + 10
-    while len(app.state.room.hub.listeners) != count:
-        assert time.monotonic() < until
-        time.sleep(0.01)
 
 
 def test_a_page_is_told_of_the_tracker_whenever_it_comes(server):

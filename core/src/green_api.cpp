@@ -24,6 +24,7 @@ constexpr double LARGEST = 1e9;
 constexpr int64_t MOST_NODES = int64_t{1} << 22;  // of the mesh
 constexpr int64_t MOST_UNKNOWNS = 4096;           // of the least squares
 constexpr int64_t MOST_CONDITIONS = 1 << 16;
+constexpr int64_t MOST_NUMBERS = 1 << 24;  // of the least squares
 constexpr int64_t MOST_TRIANGLES = int64_t{1} << 19;
 constexpr int64_t MOST_CASES = 1 << 16;
 
@@ -178,6 +179,10 @@ echospline_status check_boundary(const echospline_green_options& o, echospline_g
     return refuse(m, ECHOSPLINE_WRONG_SIZE,
                   "rank must be from 1 to %lld, the unknowns, and at most %lld, the conditions; got %lld",
                   wide(unknowns), wide(rows), wide(o.rank));
+  if (unknowns * rows > MOST_NUMBERS)
+    return refuse(m, ECHOSPLINE_WRONG_SIZE,
+                  "unknowns times conditions must be %lld at most, for they are factored; got %lld times %lld",
+                  wide(MOST_NUMBERS), wide(unknowns), wide(rows));
   bool seen[MOST_UNKNOWNS] = {};
   for (int64_t i = 0; i < o.rank; ++i) {
     const int32_t j = o.order[i];

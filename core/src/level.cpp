@@ -20,7 +20,11 @@ static_assert(sizeof every / sizeof *every == 5);
 extern "C" {
 extern const echospline::Level ECHOSPLINE_JOIN(echospline_level_, ECHOSPLINE_LEVEL);
 const echospline::Level ECHOSPLINE_JOIN(echospline_level_, ECHOSPLINE_LEVEL) = {
-    ECHOSPLINE_LEVEL, &echospline::ECHOSPLINE_CORE::tissue_entries, &echospline::ECHOSPLINE_CORE::picture_entries,
-    &echospline::ECHOSPLINE_CORE::force_entries, &echospline::ECHOSPLINE_CORE::space_entries,
-    &echospline::ECHOSPLINE_CORE::green_entries, &echospline::ECHOSPLINE_CORE::spatial_entries};
+    ECHOSPLINE_LEVEL,
+    &echospline::ECHOSPLINE_CORE::tissue_entries,
+    &echospline::ECHOSPLINE_CORE::picture_entries,
+    &echospline::ECHOSPLINE_CORE::force_entries,
+    &echospline::ECHOSPLINE_CORE::space_entries,
+    &echospline::ECHOSPLINE_CORE::green_entries,
+    &echospline::ECHOSPLINE_CORE::spatial_entries};
 }

@@ -24,7 +24,7 @@ template <int D>
 struct SlipNumbers {
   static constexpr const char* magic = D == 2 ? "echoslip" : "echoslid";
   static constexpr int64_t fixed = 3 * D + 3 + (D == 3 ? 2 * D : 0);  ///< of the needle
-  static constexpr int64_t each = 4 * D + 1;                      ///< of a station
+  static constexpr int64_t each = 4 * D + 1;                          ///< of a station
 };
 
 template <int D>
@@ -74,7 +74,7 @@ inline void each_number_of(Contact& c, Do&& act) {
 }
 
 template <int D>
-inline void save_slip(const SlipTissueIn<D>& own, void* bytes) {
+ECHOSPLINE_SET_UP void save_slip(const SlipTissueIn<D>& own, void* bytes) {
   const SlipStateIn<D>& s = own.state;
   SlipHeader header;
   std::memset(&header, 0, sizeof header);
@@ -114,8 +114,8 @@ inline echospline_status refuse_slip(Message& message, const char* writer, const
 }
 
 template <int D>
-inline echospline_status load_slip(SlipTissueIn<D>& own, const void* bytes, int64_t size, const char* writer,
-                                   Message& message) {
+ECHOSPLINE_SET_UP echospline_status load_slip(SlipTissueIn<D>& own, const void* bytes, int64_t size, const char* writer,
+                                              Message& message) {
   const unsigned char* p = static_cast<const unsigned char*>(bytes);
   const auto refuse = [&](const char* why) { return refuse_slip(message, writer, why); };
   SlipHeader header;

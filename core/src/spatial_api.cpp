@@ -20,7 +20,7 @@ namespace {
 
 constexpr double MOST_SPACINGS = 500;  // of the tissue's diagonal: a track has 512 stations at most
 constexpr int64_t MOST_SOURCES = 8192, MOST_CONDITIONS = 1 << 16;
-constexpr int32_t MOST_ALONG = 1024;             // points of the lattice
+constexpr int32_t MOST_ALONG = 1024;               // points of the lattice
 constexpr int64_t MOST_POINTS = int64_t{1} << 24;  // of the lattice
 constexpr uint32_t FACES = 63;
 
@@ -79,7 +79,8 @@ echospline_status check_tables(const echospline_spatial_options& o, Message& m) 
     return refuse(m, ECHOSPLINE_WRONG_SIZE, "condition_count must be from 1 to %lld; got %lld", wide(MOST_CONDITIONS),
                   wide(o.condition_count));
   if (!o.sources || !o.conditions || !o.condition_faces || !o.answers)
-    return refuse(m, ECHOSPLINE_NULL_POINTER, "sources, conditions, condition_faces and answers must be given; got NULL");
+    return refuse(m, ECHOSPLINE_NULL_POINTER,
+                  "sources, conditions, condition_faces and answers must be given; got NULL");
   if (o.top < ECHOSPLINE_TOP_NONE || o.top > ECHOSPLINE_TOP_SLIDING)
     return refuse(m, ECHOSPLINE_WRONG_VALUE, "top must be one of ECHOSPLINE_TOP_NONE (0), _FREE, _SLIDING (2); got %d",
                   o.top);
@@ -191,8 +192,7 @@ echospline_status echospline_spatial_create(const echospline_spatial_options* op
         echospline_level_name(echospline_level_best()), options->level, echospline_level_name(options->level));
   made.own_answers = options->source_count > 0;
   made.self = made.level->spatial->create(*options);
-  if (!made.self)
-    return refuse(made.message, ECHOSPLINE_OUT_OF_MEMORY, "memory ran out while the tissue was built");
+  if (!made.self) return refuse(made.message, ECHOSPLINE_OUT_OF_MEMORY, "memory ran out while the tissue was built");
   return ECHOSPLINE_OK;
 }
 
@@ -259,7 +259,8 @@ echospline_status echospline_spatial_needle(echospline_spatial* s, echospline_sp
 echospline_status echospline_spatial_forces(echospline_spatial* s, double* forces, int64_t room, int64_t* count) {
   if (const echospline_status status = usable(s)) return status;
   if (!count || (room > 0 && !forces))
-    return refuse(s->message, ECHOSPLINE_NULL_POINTER, "count, and forces where there is room, must be given; got NULL");
+    return refuse(s->message, ECHOSPLINE_NULL_POINTER,
+                  "count, and forces where there is room, must be given; got NULL");
   *count = s->level->spatial->forces(s->self, forces, forces ? room : -1);
   return ECHOSPLINE_OK;
 }

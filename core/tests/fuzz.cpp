@@ -13,7 +13,7 @@
 #include <limits>
 #include <vector>
 
-#include "echospline/echospline.h"
+#include "echospline/space.h"
 
 namespace {
 
@@ -60,10 +60,11 @@ class Session {
     leave();
     echospline_picture_destroy(picture_);
     echospline_forced_destroy(forced_);
+    echospline_spatial_destroy(spatial_);
   }
 
   void act() {
-    switch (choices_.below(56)) {
+    switch (choices_.below(64)) {
       case 0: open(); break;
       case 1: reset(); break;
       case 2:
@@ -100,6 +101,14 @@ class Session {
       case 49:
       case 50:
       case 51: advance_forced(); break;
+      case 56: open_spatial(); break;
+      case 57: save_spatial(); break;
+      case 58: load_spatial(); break;
+      case 59: read_spatial(); break;
+      case 60:
+      case 61:
+      case 62:
+      case 63: advance_spatial(); break;
       default: advance(); break;
     }
   }
@@ -407,6 +416,132 @@ class Session {
     read_forced();
   }
 
+  echospline_spatial* spatial() { return given() ? spatial_ : nullptr; }
+  echospline_status of_spatial(echospline_spatial* spatial, echospline_status status) {
+    known(status, echospline_spatial_message(spatial), spatial != nullptr);
+    if (!spatial) require(status != ECHOSPLINE_OK, "NULL was taken for a tissue in space");
+    return status;
+  }
+
+  /// Half space whose faces answer weakly, or at random; without sources the host answers.
+  void open_spatial() {
+    constexpr int sources = 2, conditions = 3, most = (3 * sources + 6) * 3 * conditions;
+    static const double places[3 * sources] = {-20, 5, 0, 20, 5, 0};
+    double points[3 * conditions] = {-10, 5, 0, 10, 5, 0, 0, 15, 0}, answers[most];
+    uint32_t faces[conditions] = {ECHOSPLINE_LEFT, ECHOSPLINE_RIGHT, ECHOSPLINE_BOTTOM};
+    echospline_spatial_destroy(spatial_);
+    spatial_ = nullptr;
+    echospline_spatial_options o;
+    std::memset(&o, 0, sizeof o);
+    o.struct_size = sizeof o;
+    echospline_spatial_defaults(&o);
+    if (choices_.rarely()) o.struct_size = choices_.byte();
+    o.level = choices_.below(4) == 0 ? choices_.whole(0, 5) : ECHOSPLINE_LEVEL_BEST;
+    for (int k = 0; k < 3; ++k) {
+      o.low[k] = k == 1 ? 0 : choices_.number(-12, -8), o.high[k] = choices_.number(10, 16);
+      o.lattice_shape[k] = choices_.whole(4, 6), o.lattice_spacing[k] = choices_.number(5, 8);
+      o.lattice_origin[k] = choices_.number(-14, -10);
+    }
+    double* numbers[] = {&o.tip,           &o.friction_limit,  &o.bond,          &o.tip_stiffness,  &o.side_stiffness,
+                         &o.viscosity,     &o.station_spacing, &o.substep,       &o.dead_band,      &o.poisson,
+                         &o.shear_modulus, &o.radius,          &o.source_radius, &o.traction_length};
+    for (double* number : numbers)
+      if (choices_.below(16) == 0) *number = choices_.number(0, 2);
+    const double wild = choices_.rarely() ? 10 : 0;
+    for (double& answer : answers) answer = wild > 0 ? choices_.number(-wild, wild) : 0;
+    for (double& point : points)
+      if (choices_.rarely()) point = choices_.number(-20, 20);
+    if (choices_.rarely()) faces[choices_.below(conditions)] = static_cast<uint32_t>(choices_.whole(0, 64));
+    o.top = choices_.whole(0, 2);
+    o.clamped = choices_.rarely() ? choices_.byte() : 33u, o.sliding = choices_.rarely() ? choices_.byte() : 2u;
+    o.sources = given() ? places : nullptr, o.source_count = choices_.below(3) ? sources : 0;
+    o.conditions = given() ? points : nullptr, o.condition_faces = given() ? faces : nullptr;
+    o.condition_count = conditions, o.answers = given() ? answers : nullptr;
+    o.answer_count = choices_.size((3 * sources + (o.top == ECHOSPLINE_TOP_SLIDING ? 3 : 6)) * 3 * conditions);
+    const echospline_status status = echospline_spatial_create(given() ? &o : nullptr, given() ? &spatial_ : nullptr);
+    known(status, echospline_spatial_message(spatial_), spatial_ != nullptr);
+  }
+
+  bool answer_spatial() {
+    echospline_spatial_station station;
+    std::memset(&station, 0, sizeof station);
+    echospline_spatial* s = spatial();
+    if (of_spatial(s, echospline_spatial_wanted(s, given() ? &station : nullptr)) != ECHOSPLINE_OK) return false;
+    require(station.index >= 0 && station.index < 1000 && station.point_count >= 0 && station.point_count <= 4,
+            "a wanted station that cannot be");
+    const bool wild = choices_.rarely();
+    std::vector<double> rows(9 * (station.index + 1));
+    for (size_t i = 0; i < rows.size(); ++i) {
+      const bool own = i + 9 >= rows.size();
+      rows[i] = wild ? choices_.number(-5, 5) : i % 9 % 4 != 0 ? 0.0 : own ? 2.0 : 0.5;
+    }
+    return of_spatial(s, echospline_spatial_answer(s, given() ? rows.data() : nullptr,
+                                                   choices_.size(int64_t(rows.size())))) == ECHOSPLINE_OK;
+  }
+
+  void advance_spatial() {
+    if (!spatial_) open_spatial();
+    if (choices_.below(4) == 0) spatial_entry_ = choices_.number(-6, 6);
+    echospline_pose pose;
+    std::memset(&pose, 0, sizeof pose);
+    pose.entry[0] = spatial_entry_, pose.entry[1] = -choices_.below(2), pose.entry[2] = 1;
+    for (int k = 0; k < 3; ++k) pose.tip[k] = choices_.number(k == 1 ? -2 : -8, 12);
+    pose.dt = choices_.number(0, 0.1);
+    echospline_spatial* s = spatial();
+    for (int i = 0; i < 60; ++i) {
+      if (of_spatial(s, echospline_spatial_advance(s, given() ? &pose : nullptr)) != ECHOSPLINE_NEEDS_STATION) break;
+      if (!answer_spatial()) break;
+    }
+    read_spatial();
+  }
+
+  void read_spatial() {
+    echospline_spatial* s = spatial();
+    echospline_spatial_load load;
+    if (of_spatial(s, echospline_spatial_needle(s, given() ? &load : nullptr)) == ECHOSPLINE_OK && s)
+      require(std::isfinite(load.tip) && std::isfinite(load.torque[2]) && load.tip >= 0, "a force that is not finite");
+    std::vector<double> forces(3 * 40);
+    int64_t count = 0;
+    of_spatial(s, echospline_spatial_forces(s, given() ? forces.data() : nullptr, choices_.below(41),
+                                            given() ? &count : nullptr));
+    require(count >= 0, "a negative number of forces");
+    std::vector<echospline_spatial_station> stations(choices_.below(8));
+    of_spatial(s, echospline_spatial_stations(s, given() ? stations.data() : nullptr, int64_t(stations.size()),
+                                              given() ? &count : nullptr));
+    echospline_force_field field;
+    std::memset(&field, 0, sizeof field);
+    field.struct_size = choices_.rarely() ? choices_.byte() : sizeof field;
+    const double at[6] = {1, 2, 3, choices_.number(-9, 9), choices_.number(0, 15), choices_.number(-9, 9)};
+    double u[6] = {};
+    if (of_spatial(s, echospline_spatial_field(s, given() ? &field : nullptr)) == ECHOSPLINE_OK &&
+        echospline_force_field_at(&field, at, 2, u) == ECHOSPLINE_OK)
+      for (double v : u) require(std::isfinite(v), "a displacement that is not finite");
+    if (choices_.rarely()) of_spatial(s, echospline_spatial_reset(s));
+  }
+
+  void save_spatial() {
+    echospline_spatial* s = spatial();
+    const int64_t size = echospline_spatial_state_size(s);
+    require(size >= 0 && size < (1 << 24), "the size of a state");
+    std::vector<uint8_t> bytes(size);
+    const int64_t room = choices_.size(size);
+    if (of_spatial(s, echospline_spatial_state_save(s, given() ? bytes.data() : nullptr, room)) == ECHOSPLINE_OK &&
+        size <= room)
+      spatial_saved_ = bytes;
+  }
+
+  void load_spatial() {
+    if (spatial_saved_.empty()) return;
+    std::vector<uint8_t> bytes = spatial_saved_;
+    for (int n = choices_.below(3); n > 0; --n)
+      bytes[(choices_.byte() * 256 + choices_.byte()) % bytes.size()] ^= 1 << choices_.below(8);
+    if (choices_.below(6) == 0) bytes.resize(bytes.size() * choices_.byte() / 256);
+    echospline_spatial* s = spatial();
+    of_spatial(s, echospline_spatial_state_load(s, given() ? bytes.data() : nullptr,
+                                                choices_.rarely() ? -1 : int64_t(bytes.size())));
+    read_spatial();
+  }
+
   echospline_picture* picture() { return given() ? picture_ : nullptr; }
   echospline_status drawn(echospline_picture* picture, echospline_status status) {
     known(status, echospline_picture_message(picture), picture != nullptr);
@@ -548,6 +683,9 @@ class Session {
   int64_t forced_nodes_ = 0;
   double forced_low_[2] = {}, forced_size_[2] = {20, 20}, forced_entry_ = 5;
   std::vector<uint8_t> forced_saved_;
+  echospline_spatial* spatial_ = nullptr;
+  double spatial_entry_ = 0;
+  std::vector<uint8_t> spatial_saved_;
   echospline_picture* picture_ = nullptr;
   int64_t mesh_nodes_ = 0, pixels_ = 0, bytes_ = 0;
   bool good_ = false;

@@ -489,7 +489,6 @@ namespace Echospline
 
         private readonly Answer answer;
         private IntPtr handle;
-        private Green green;  // kept from the collector
 
         public Forced(ForcedOptions options, Answer answer)
         {
@@ -502,11 +501,10 @@ namespace Echospline
             throw new EchosplineException(status, message);
         }
 
-        /// <summary>Tissue that a green of its mesh and level answers, in the core; the green has to live as long.</summary>
+        /// <summary>Tissue that a green of its mesh and level answers, in the core; the green is disposed after it.</summary>
         public Forced(ForcedOptions options, Green green) : this(options, (Answer)null)
         {
             var status = Native.echospline_forced_attach(handle, green.Handle);
-            this.green = green;
             if (status == Status.Ok) return;
             var message = Native.Text(Native.echospline_forced_message(handle));
             Dispose();

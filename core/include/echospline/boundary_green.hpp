@@ -74,7 +74,7 @@ ECHOSPLINE_INLINE void two_products(const double* row, const double* a, const do
 class BoundaryGreen {
  public:
   /// The options have been checked. False when memory runs out.
-  bool build(const echospline_green_options& o, const GreenMesh& mesh) {
+  ECHOSPLINE_SET_UP bool build(const echospline_green_options& o, const GreenMesh& mesh) {
     mesh_ = &mesh, radius_ = o.radius, weight_ = o.weight, pin_weight_ = o.pin_weight, pin_radius_ = o.pin_radius;
     bodies_ = o.body_count, bands_ = o.band_count, conditions_ = o.condition_count, pins_ = o.pin_count, rank_ = o.rank;
     if (!body_.reserve(bodies_) || !depth_.reserve(bands_ + 1) || !circle_.reserve(3 * (bodies_ - bands_)) ||
@@ -333,7 +333,7 @@ class BoundaryGreen {
   }
 
   /// Column of the conditions under one unknown of unit strength, (rows) numbers.
-  void condition_column(int64_t unknown, double* column) const {
+  ECHOSPLINE_SET_UP void condition_column(int64_t unknown, double* column) const {
     if (unknown >= own_) {
       const int64_t k = (unknown - own_) / 2;
       const Vec<2> unit = {{(unknown - own_) % 2 == 0 ? 1.0 : 0.0, (unknown - own_) % 2 == 1 ? 1.0 : 0.0}};
@@ -372,7 +372,7 @@ class BoundaryGreen {
   }
 
   /// The two factors of the least squares: given, or by Gram and Schmidt, twice, of the kept columns in their order.
-  bool factor(const echospline_green_options& o) {
+  ECHOSPLINE_SET_UP bool factor(const echospline_green_options& o) {
     const int64_t ld = padded(rows_), lk = padded(rank_);
     if (!left_.reserve(rank_ * ld) || !right_.reserve(unknowns_ * lk)) return false;
     if (o.left) {
@@ -409,7 +409,7 @@ class BoundaryGreen {
   }
 
   /// Columns that take strengths to the mesh nodes, or to a lattice from which they are interpolated.
-  bool evaluate(double distance) {
+  ECHOSPLINE_SET_UP bool evaluate(double distance) {
     if (bodies_ == 1 && distance > 0) {
       const int64_t nx = lattice_count(0, distance), ny = lattice_count(1, distance);
       if (static_cast<double>(nx * ny) <= LATTICE_PAYS * static_cast<double>(mesh_->nodes())) {
@@ -439,7 +439,7 @@ class BoundaryGreen {
     return middle - half * std::cos(CIRCLE / 2 * static_cast<double>(i) / static_cast<double>(count - 1));
   }
   /// Barycentric weights from Chebyshev points to mesh lines, (lines, points).
-  void interpolation(int d, int64_t count, int64_t lines, double* weights) const {
+  ECHOSPLINE_SET_UP void interpolation(int d, int64_t count, int64_t lines, double* weights) const {
     const double tiny = 1e-12 * (mesh_->high[d] - mesh_->low[d]);
     for (int64_t i = 0; i < lines; ++i) {
       double* row = weights + i * count;

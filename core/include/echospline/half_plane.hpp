@@ -14,9 +14,6 @@ namespace echospline::ECHOSPLINE_CORE {
 constexpr double CIRCLE = 6.283185307179586477;  // 2 pi
 constexpr double SHALLOWEST = 1.0;               // radii: least depth of a force below a free or clamped top
 
-/// Set-up runs once: these functions are compiled for size.
-#define SETUP_SIZE __attribute__((noinline))
-
 /// Angle in the right half plane to 3e-16: nearest of three known ones, and the series of what is left (below tan pi / 16).
 ECHOSPLINE_INLINE Doubles arctangent(Doubles t) {
   const Doubles size = greatest(t, -t), one = all(1.0);
@@ -61,7 +58,7 @@ struct HalfPlane {
   double scale() const { return 1 / (4 * CIRCLE * stiffness * (1 - nu)); }
 
   /// Displacement of p by unit forces at s that are spread over a radius (0: points), mm/N.
-  SETUP_SIZE Block displacement(const Vec<2>& p, const Vec<2>& s, double radius) const {
+  __attribute__((noinline)) Block displacement(const Vec<2>& p, const Vec<2>& s, double radius) const {
     Block K;
     displacement(p[0] - s[0], p[1] - surface, depth(s, radius), radius, K.v);
     return K;

@@ -12,6 +12,8 @@
 #include "level_begin.hpp"
 
 #define ECHOSPLINE_INLINE inline __attribute__((always_inline))
+/// Set-up runs once: these functions are compiled for size.
+#define ECHOSPLINE_SET_UP __attribute__((noinline, cold))
 
 namespace echospline::ECHOSPLINE_CORE {
 

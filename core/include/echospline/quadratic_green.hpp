@@ -27,7 +27,7 @@ class QuadraticGreen {
  public:
   enum Outcome { done, no_memory, not_held };
 
-  Outcome build(const echospline_green_options& o, const GreenMesh& mesh) {
+  ECHOSPLINE_SET_UP Outcome build(const echospline_green_options& o, const GreenMesh& mesh) {
     mesh_ = &mesh, radius_ = o.radius;
     columns_ = o.line_x_count - 1, rows_ = o.line_y_count - 1, across_ = 2 * columns_ + 1;
     if (!x_.reserve(columns_ + 1) || !y_.reserve(rows_ + 1) || !held_.reserve(o.held_count) ||
@@ -117,7 +117,7 @@ class QuadraticGreen {
   const SixNodes& at_node(int64_t i) const { return at_node_[i]; }
 
   /// Triangle and shape functions at a point of the tissue.
-  SixNodes locate(const Vec<2>& p) const {
+  __attribute__((noinline)) SixNodes locate(const Vec<2>& p) const {
     const int64_t i = interval(x_, p[0]), j = interval(y_, p[1]);
     const double s = share(x_, i, p[0]), t = share(y_, j, p[1]);
     const bool turned = (i + j) % 2 == 1, second = turned ? s + t > 1 : t > s;
@@ -201,7 +201,7 @@ class QuadraticGreen {
   }
 
   /// Count what the parts need.
-  void divide(int64_t a, int64_t b, int64_t c, int64_t d, int64_t& indices, int64_t& numbers) {
+  ECHOSPLINE_SET_UP void divide(int64_t a, int64_t b, int64_t c, int64_t d, int64_t& indices, int64_t& numbers) {
     if (halved(a, b, c, d)) {
       const bool up = upright(a, b, c, d);
       const int64_t middle = up ? (a + b) / 2 : (c + d) / 2;

@@ -132,9 +132,10 @@ typedef struct echospline_spatial_options {
   const double* conditions;        /* (condition_count, 3) points on the faces, mm */
   const uint32_t* condition_faces; /* (condition_count) the face of each */
   int64_t condition_count;
-  const double* answers; /* (3 * source_count + motions, 3 * condition_count): boundary forces, N, and rigid motions (6, or shifts
+  const double*
+      answers; /* (3 * source_count + motions, 3 * condition_count): boundary forces, N, and rigid motions (6, or shifts
                             along x and z and the turn about y under a sliding top) by what the needle does to the conditions */
-  int64_t answer_count;  /* numbers of it */
+  int64_t answer_count;     /* numbers of it */
   int32_t lattice_shape[3]; /* of the lattice that carries what the faces do, 4 or more points each */
   int32_t lattice_reserved;
   double lattice_spacing[3], lattice_origin[3]; /* mm */

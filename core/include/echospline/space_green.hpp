@@ -71,7 +71,8 @@ inline Response3<T> kelvinlet(const T (&d)[3], double nu, double spread) {
 
 /// A unit force at a source below the surface, spread over a radius (spread: its square), and its image.
 template <class T>
-inline Response3<T> response_in_space(const T (&p)[3], const double* source, double nu, double spread, Top top) {
+__attribute__((noinline)) Response3<T> response_in_space(const T (&p)[3], const double* source, double nu,
+                                                         double spread, Top top) {
   const double c = source[1], a = 3 - 4 * nu;
   const T d[3] = {p[0] - source[0], p[1] - c, p[2] - source[2]};
   Response3<T> G = kelvinlet(d, nu, spread);
@@ -104,7 +105,7 @@ inline Response3<T> response_in_space(const T (&p)[3], const double* source, dou
 class SpaceGreen {
  public:
   /// Copy the tables; false when memory runs out. Numbers have been checked.
-  bool prepare(const echospline_spatial_options& o) {
+  ECHOSPLINE_SET_UP bool prepare(const echospline_spatial_options& o) {
     top_ = o.top == ECHOSPLINE_TOP_FREE ? Top::free : o.top == ECHOSPLINE_TOP_SLIDING ? Top::sliding : Top::none;
     nu_ = o.poisson, mu_ = o.shear_modulus, radius_ = o.radius, source_radius_ = o.source_radius;
     scale_ = 1 / (16 * 3.14159265358979323846 * mu_ * (1 - nu_));
@@ -132,7 +133,7 @@ class SpaceGreen {
       for (int y = 0; y < shape_[1]; ++y)
         for (int x = 0; x < shape_[0]; ++x, i += 3)
           point_[i] = origin_[0] + spacing_[0] * x, point_[i + 1] = origin_[1] + spacing_[1] * y,
-                 point_[i + 2] = origin_[2] + spacing_[2] * z;
+          point_[i + 2] = origin_[2] + spacing_[2] * z;
     return true;
   }
   int64_t unknowns() const { return 3 * sources_ + motions_; }
@@ -163,8 +164,8 @@ class SpaceGreen {
   bool field(const SlipTissueIn<3>& tissue, echospline_force_field& out) {
     const int64_t count = tissue.state.count;
     if (forces_.size() < 3 * count && !forces_.reserve(3 * (count + 32))) return false;
-    if (place_.size() < 12 * count && (!place_.reserve(12 * (count + 32)) || !load_.reserve(12 * (count + 32)) ||
-                                       !spread_.reserve(4 * (count + 32))))
+    if (place_.size() < 12 * count &&
+        (!place_.reserve(12 * (count + 32)) || !load_.reserve(12 * (count + 32)) || !spread_.reserve(4 * (count + 32))))
       return false;
     tissue.forces(forces_.data());
     for (int64_t r = 0; r < unknowns(); ++r) answer_[r] = 0;
@@ -176,16 +177,24 @@ class SpaceGreen {
       const double* made = made_[j].data();
       for (int64_t r = 0; r < unknowns(); ++r)
         answer_[r] += made[3 * r] * f[0] + made[3 * r + 1] * f[1] + made[3 * r + 2] * f[2];
-      for (int k = 0; k < station.count; ++k, ++used) {
+      for (int k = 0; k < station.count; ++k) {
         const Vec<3> p = below(station.points[k]);
-        for (int d = 0; d < 3; ++d) place_[3 * used + d] = p[d], load_[3 * used + d] = station.weights[k] * f[d];
-        spread_[used] = radius_;
+        int64_t at = used;
+        for (int64_t other = used - 1; other >= 0 && other >= used - 4; --other)
+          if (coincide(p, &place_[3 * other])) at = other;
+        if (at == used) {
+          for (int d = 0; d < 3; ++d) place_[3 * at + d] = p[d], load_[3 * at + d] = 0;
+          spread_[used++] = radius_;
+        }
+        for (int d = 0; d < 3; ++d) load_[3 * at + d] += station.weights[k] * f[d];
       }
     }
     faces();
     std::memset(&out, 0, sizeof out);
     out.struct_size = sizeof out;
-    out.top = top_ == Top::free ? ECHOSPLINE_TOP_FREE : top_ == Top::sliding ? ECHOSPLINE_TOP_SLIDING : ECHOSPLINE_TOP_NONE;
+    out.top = top_ == Top::free      ? ECHOSPLINE_TOP_FREE
+              : top_ == Top::sliding ? ECHOSPLINE_TOP_SLIDING
+                                     : ECHOSPLINE_TOP_NONE;
     out.poisson = nu_, out.shear_modulus = mu_;
     out.places = place_.data(), out.forces = load_.data(), out.radii = spread_.data(), out.force_count = used;
     for (int k = 0; k < 3; ++k)
@@ -211,6 +220,13 @@ class SpaceGreen {
   Vec<3> below(Vec<3> p) const {
     if (top_ != Top::none && p[1] < radius_) p[1] = radius_;
     return p;
+  }
+
+  /// Whether two forces act in one place. The hats of neighbours overlap by two points of four: half of the forces are another's.
+  static bool coincide(const Vec<3>& p, const double* q) {
+    for (int d = 0; d < 3; ++d)
+      if (!(std::fabs(p[d] - q[d]) < 1e-9)) return false;
+    return true;
   }
 
   /// Rigid motion at a point: shifts along x, y, z and turns about them.
@@ -300,8 +316,12 @@ class SpaceGreen {
     const float spread = static_cast<float>(source_radius_ * source_radius_);
     for (int64_t m = 0; m < sources_; ++m) {
       const double *s = &source_[3 * m], *f = &answer_[3 * m];
-      outer_[m] = {static_cast<float>(s[0]),          static_cast<float>(s[1]),          static_cast<float>(s[2]),
-                   static_cast<float>(f[0] * scale_), static_cast<float>(f[1] * scale_), static_cast<float>(f[2] * scale_),
+      outer_[m] = {static_cast<float>(s[0]),
+                   static_cast<float>(s[1]),
+                   static_cast<float>(s[2]),
+                   static_cast<float>(f[0] * scale_),
+                   static_cast<float>(f[1] * scale_),
+                   static_cast<float>(f[2] * scale_),
                    spread};
     }
     const SpaceField sum = {outer_.data(), sources_, static_cast<float>(nu_), top_, nullptr};

@@ -46,15 +46,12 @@ class Volume {
   /// Draw a bent slice. Returns the number of shown pixels whose place lies outside the volume; -1 when memory runs out.
   int64_t slice(const echospline_slice& s, const double* lattice, uint8_t* out) const {
     const int across = (s.columns - 1 + s.step - 1) / s.step + 1, lines = (s.rows - 1 + s.step - 1) / s.step + 1;
-    const int padded = static_cast<int>(rounded_up(s.columns, LANES));
-    Array<int32_t> cell;
-    Array<float> share, line;
-    if (!cell.reserve(padded) || !share.reserve(padded) || !line.reserve(3 * int64_t(across + 1))) return -1;
-    for (int k = 0; k < padded; ++k) {
-      const int column = smaller(k, s.columns - 1);
-      cell[k] = smaller(column / s.step, larger(across - 2, 0));
-      share[k] = static_cast<float>(column - cell[k] * s.step) / static_cast<float>(s.step);
-    }
+    const int cells = larger(across - 1, 1), padded = cells * s.step + 2 * LANES;
+    Array<float> shares, line, places;
+    if (!shares.reserve(s.step + 1 + LANES) || !line.reserve(3 * int64_t(across + 1)) ||
+        !places.reserve(3 * int64_t(padded)))
+      return -1;
+    for (int k = 0; k < s.step + 1 + LANES; ++k) shares[k] = static_cast<float>(k) / static_cast<float>(s.step);
     const int stride = across + 1;
     int64_t outside = 0;
     for (int row = 0; row < s.rows; ++row) {
@@ -68,39 +65,52 @@ class Volume {
           line[int64_t(k) * stride + i] =
               static_cast<float>((upper[at] + down * (lower[at] - upper[at]) - origin_[k]) * scale_[k]);
         }
+      for (int k = 0; k < 3; ++k) {  // a cell writes beyond its end, the next one over it
+        const float* from = line.data() + int64_t(k) * stride;
+        float* to = places.data() + int64_t(k) * padded;
+        for (int cell = 0; cell < cells; ++cell)
+          for (int j = 0; j < s.step + (cell == cells - 1); j += LANES)
+            store(to + cell * s.step + j, from[cell] + load(shares.data() + j) * (from[cell + 1] - from[cell]));
+      }
       const float spread = s.spread ? s.spread[row] : 0.0f;
       Floats aside[3];
       for (int k = 0; k < 3; ++k) aside[k] = all(static_cast<float>(s.normal[k] * scale_[k]) * spread);
+      Ints beyond = all_ints(0);  // minus the number of shown pixels outside
       for (int first = 0; first < s.columns; first += LANES) {
-        const Ints at = load_ints(cell.data() + first);
-        const Floats right = load(share.data() + first);
-        Floats place[3];
-        for (int k = 0; k < 3; ++k) {
-          const float* from = line.data() + int64_t(k) * stride;
-          const Floats a = gather(from, at), b = gather(from + 1, at);
-          place[k] = a + right * (b - a);
+        const int here = smaller(LANES, s.columns - first);
+        const int64_t to = int64_t(row) * s.columns + first;
+        Ints shown = counting() < here;
+        if (s.mask) shown &= to_mask(s.mask + to, here);
+        if (!any(shown)) {
+          std::memset(out + to, s.background, static_cast<size_t>(here));
+          continue;
         }
+        Floats place[3];
+        for (int k = 0; k < 3; ++k) place[k] = load(places.data() + int64_t(k) * padded + first);
         Ints inside;
         Floats value = sample_at(place, inside);
         if (spread > 0) value = across_slice(place, aside, value);
-        const Ints grey = pick(inside, to_ints(value + 0.5f), all_ints(s.background));
-        const int here = smaller(LANES, s.columns - first);
-        const int64_t to = int64_t(row) * s.columns + first;
-        for (int i = 0; i < here; ++i) {
-          const bool shown = !s.mask || s.mask[to + i];
-          out[to + i] = static_cast<uint8_t>(shown ? grey[i] : s.background);
-          outside += shown && !inside[i];
-        }
+        const Ints grey = pick(inside & shown, to_ints(value + 0.5f), all_ints(s.background));
+        beyond += shown & ~inside;
+        const LaneBytes bytes = __builtin_convertvector(grey, LaneBytes);
+        std::memcpy(out + to, &bytes, static_cast<size_t>(here));
       }
+      for (int i = 0; i < LANES; ++i) outside -= beyond[i];
     }
     return outside;
   }
 
  private:
-  static Ints load_ints(const int32_t* p) {
-    Ints v;
-    std::memcpy(&v, p, sizeof v);
-    return v;
+  /// Lanes whose byte is not 0.
+  static Ints to_mask(const uint8_t* bytes, int count) {
+    LaneBytes read = {};
+    std::memcpy(&read, bytes, static_cast<size_t>(count));
+    return __builtin_convertvector(read, Ints) != 0;
+  }
+  static bool any(Ints mask) {
+    int32_t found = 0;
+    for (int i = 0; i < LANES; ++i) found |= mask[i];
+    return found != 0;
   }
   /// Place of a word in memory: of its brick, then within it.
   template <class Whole>

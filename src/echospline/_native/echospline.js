@@ -1237,7 +1237,7 @@ export class Spatial {
     this.core.write(this.pose, LAYOUTS.echospline_pose, pose);
     let status = functions.echospline_spatial_advance(this.handle, this.pose);
     while (status === Status.NEEDS_STATION && this.answer !== null) {
-      const wanted = /** @type {any} */ (this.given("echospline_spatial_station", functions.echospline_spatial_wanted));
+      const wanted = /** @type {any} */ (this.given("echospline_spatial_station", (at) => functions.echospline_spatial_wanted(this.handle, at)));
       const rows = this.answer(wanted);
       const at = this.core.place(rows);
       try {
@@ -1250,11 +1250,11 @@ export class Spatial {
     this.check(status);
   }
 
-  /** A struct that a function of the handle fills. @param {keyof typeof LAYOUTS} name @param {Function} call @returns {Record<string, number | number[]>} */
+  /** A struct that a call fills. @param {keyof typeof LAYOUTS} name @param {(at: number) => number} call @returns {Record<string, number | number[]>} */
   given(name, call) {
     const at = this.core.allocate(LAYOUTS[name].size);
     try {
-      this.check(call(this.handle, at));
+      this.check(call(at));
       return this.core.read(at, LAYOUTS[name]);
     } finally {
       this.core.functions.free(at);
@@ -1263,32 +1263,37 @@ export class Spatial {
 
   /** The needle's forces. @returns {SpatialLoad} */
   load() {
-    return /** @type {any} */ (this.given("echospline_spatial_load", this.core.functions.echospline_spatial_needle));
+    const { functions } = this.core;
+    return /** @type {any} */ (this.given("echospline_spatial_load", (at) => functions.echospline_spatial_needle(this.handle, at)));
   }
 
   /** Force at every station, three numbers each, N. @returns {Float64Array} */
   forces() {
     const { functions } = this.core;
-    return this.listed(functions.echospline_spatial_forces, 24, (at, count) => new Float64Array(this.core.buffer, at, 3 * count).slice());
+    return this.listed(
+      (list, room, count) => functions.echospline_spatial_forces(this.handle, list, room, count), 24,
+      (at, count) => new Float64Array(this.core.buffer, at, 3 * count).slice());
   }
 
   /** Where they act. @returns {SpatialStation[]} */
   stations() {
+    const { functions } = this.core;
     const shape = LAYOUTS.echospline_spatial_station;
-    return this.listed(this.core.functions.echospline_spatial_stations, shape.size, (at, count) =>
-      Array.from({ length: count }, (_, i) => /** @type {any} */ (this.core.read(at + i * shape.size, shape))));
+    return this.listed(
+      (list, room, count) => functions.echospline_spatial_stations(this.handle, list, room, count), shape.size,
+      (at, count) => Array.from({ length: count }, (_, i) => /** @type {any} */ (this.core.read(at + i * shape.size, shape))));
   }
 
-  /** What a function writes of which there are many. @template T @param {Function} call @param {number} size @param {(at: number, count: number) => T} read @returns {T} */
+  /** What a function writes of which there are many. @template T @param {(list: number, room: bigint, count: number) => number} call @param {number} size @param {(at: number, count: number) => T} read @returns {T} */
   listed(call, size, read) {
     const { functions } = this.core;
     const number = this.core.allocate(8);
     let list = 0;
     try {
-      this.check(call(this.handle, 0, 0n, number));
+      this.check(call(0, 0n, number));
       const count = Number(new BigInt64Array(this.core.buffer, number, 1)[0]);
       list = this.core.allocate(size * count);
-      this.check(call(this.handle, list, BigInt(count), number));
+      this.check(call(list, BigInt(count), number));
       return read(list, count);
     } finally {
       functions.free(number);

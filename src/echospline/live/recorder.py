@@ -13,6 +13,8 @@ from echospline.live.snapshot import Snapshot
 from echospline.scene import Floats, NeedlePose
 
 MOST_ROWS, MOST_WATCHED = 2_000_000, 64
+IN_SPACE = -3.0
+"""Stands before a stored trace in space, where one in the plane has its period."""
 
 
 @dataclass(frozen=True)
@@ -23,9 +25,9 @@ class Trace:
     ----------
     period : float
         s.
-    poses : ndarray, shape (n, 5)
-        entry x, y, tip x, y (mm), speed (mm/s).
-    watched : ndarray, shape (n, k, 2)
+    poses : ndarray, shape (n, 2 D + 1)
+        entry, tip (D numbers each, mm), speed (mm/s); D is 2 in the plane and 3 in space.
+    watched : ndarray, shape (n, k, D)
         Deformed positions of target and vessels, mm.
     """
 
@@ -43,34 +45,40 @@ class Trace:
         return times
 
     @property
+    def dimension(self) -> int:
+        """2 in the plane, 3 in space."""
+        return 3 if self.poses.shape[1] == 7 else 2
+
+    @property
     def entry(self) -> Floats:
-        """Points of entry, shape (n, 2), mm."""
-        return self.poses[:, 0:2]
+        """Points of entry, shape (n, D), mm."""
+        return self.poses[:, : self.dimension]
 
     @property
     def tip(self) -> Floats:
-        """Tips, shape (n, 2), mm."""
-        return self.poses[:, 2:4]
+        """Tips, shape (n, D), mm."""
+        return self.poses[:, self.dimension : 2 * self.dimension]
 
     @property
     def depth(self) -> Floats:
         """Insertion depths, shape (n,), mm."""
         along = self.tip - self.entry
-        depth: Floats = np.hypot(along[:, 0], along[:, 1])
-        return depth
+        if self.dimension == 2:
+            depth: Floats = np.hypot(along[:, 0], along[:, 1])
+            return depth
+        return np.asarray(np.linalg.norm(along, axis=1))
 
     def pose(self, row: int) -> NeedlePose:
-        """Return one pose."""
+        """Return one pose in the plane."""
         x, y, tx, ty, speed = (float(v) for v in self.poses[row])
         return NeedlePose((x, y), (tx, ty), speed)
 
     def to_bytes(self) -> bytes:
         """Compress to bytes for storage."""
-        n, k = len(self), self.watched.shape[1]
-        head = np.array([self.period, n, k], "<f8").tobytes()
-        return head + zlib.compress(
-            np.hstack([self.poses, self.watched.reshape(n, 2 * k)]).astype("<f8").tobytes()
-        )
+        n, k, D = len(self), self.watched.shape[1], self.dimension
+        head = [self.period, n, k] if D == 2 else [IN_SPACE, self.period, n, k]
+        rows = np.hstack([self.poses, self.watched.reshape(n, D * k)])
+        return np.array(head, "<f8").tobytes() + zlib.compress(rows.astype("<f8").tobytes())
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Trace:
@@ -81,12 +89,15 @@ class Trace:
         InputError
             If the bytes are not a trace.
         """
+        D = 3 if data[:8] == np.array([IN_SPACE], "<f8").tobytes() else 2
+        data = data[8:] if D == 3 else data
         if len(data) < 24:
             raise InputError("a stored trace is cut short")
         period, n, k = np.frombuffer(data[:24], "<f8")
         if not (isfinite(period) and period > 0 and 0 <= n <= MOST_ROWS and 0 <= k <= MOST_WATCHED):
             raise InputError("a stored trace has no valid head")
-        size = int(n) * (5 + 2 * int(k)) * 8
+        columns = 2 * D + 1 + D * int(k)
+        size = int(n) * columns * 8
         inflate = zlib.decompressobj()
         try:
             content = inflate.decompress(data[24:], size + 1)
@@ -94,10 +105,11 @@ class Trace:
             raise InputError("a stored trace is damaged") from error
         if len(content) != size or not inflate.eof:
             raise InputError("a stored trace has another length than its head says")
-        rows = np.frombuffer(content, "<f8").reshape(int(n), 5 + 2 * int(k))
+        rows = np.frombuffer(content, "<f8").reshape(int(n), columns)
         if not np.isfinite(rows).all():
             raise InputError("a stored trace has numbers that are not finite")
-        return cls(float(period), rows[:, :5].copy(), rows[:, 5:].reshape(int(n), int(k), 2).copy())
+        poses, watched = rows[:, : 2 * D + 1], rows[:, 2 * D + 1 :]
+        return cls(float(period), poses.copy(), watched.reshape(int(n), int(k), D).copy())
 
 
 class Recorder:

@@ -46,6 +46,10 @@ class GreenResponse:
     ) -> None:
         self.solver, self.tissue, self.method, self.reason = solver, tissue, method, reason
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What is pickled: all but the core's copy, which is made anew."""
+        return {name: value for name, value in self.__dict__.items() if name != "native"}
+
     @property
     def grid(self) -> RegularGrid:
         """The mesh whose nodes carry the displacement."""

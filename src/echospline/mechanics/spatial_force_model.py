@@ -258,7 +258,9 @@ class SpatialForceModel:
         every = [*(a.column for a in track), new]
         first = np.cumsum([0, *(len(c.places) for c in every)])
         at = self.response.column_at(new, np.concatenate([c.places for c in every]))
-        rows = np.stack([np.tensordot(c.weights, at[first[j] : first[j + 1]], 1) for j, c in enumerate(every)])
+        rows = np.stack(
+            [np.tensordot(c.weights, at[first[j] : first[j + 1]], 1) for j, c in enumerate(every)]
+        )
         return SpatialAnswered(station, new, rows)
 
     def _advance(self, state: SpatialForceState, pose: SpatialPose, dt: float) -> SpatialForceState:

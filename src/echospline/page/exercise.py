@@ -1,6 +1,6 @@
 """Exercises: a target in the tissue, perhaps vessels to avoid, and the criteria of success.
 
-They are the ``[[exercise]]`` tables of a scenario; three are provided for any image.
+They are the ``[[exercise]]`` tables of a scenario; three are provided for any image, two for any volume.
 """
 
 from __future__ import annotations
@@ -12,41 +12,84 @@ from echospline.scenario import DiscSection as Disc
 from echospline.scenario import ExerciseSection as Exercise
 from echospline.scene import RegularGrid
 
-__all__ = ["Disc", "Exercise", "check_exercises", "default_exercises"]
+__all__ = ["Disc", "Exercise", "check_exercises", "default_exercises", "default_exercises_space"]
+
+SLACK = 1e-9
+"""mm, rounding."""
 
 
-def check_exercises(exercises: Sequence[Exercise], grid: RegularGrid) -> None:
+def check_exercises(exercises: Sequence[Exercise], low: Sequence[float], high: Sequence[float]) -> None:
     """Check names and positions of exercises against each other and the mesh.
+
+    Parameters
+    ----------
+    exercises : sequence of Exercise
+        Of one scene.
+    low, high : sequence of float
+        Corners of its mesh, mm: two numbers each in the plane, three in space.
 
     Raises
     ------
     InputError
-        If two share a name, or a target, a vessel or an entry lies outside the mesh.
+        If two share a name, or a target, a vessel or an entry lies outside the mesh or has another number of coordinates.
     """
     names = [exercise.name for exercise in exercises]
+    axes = " and ".join(f"{axis} from {a:g} to {b:g}" for axis, a, b in zip("xyz", low, high, strict=False))
+
+    def outside(place: Sequence[float]) -> bool:
+        return len(place) != len(low) or not all(
+            a - SLACK <= v <= b + SLACK for a, v, b in zip(low, place, high, strict=True)
+        )
+
     for exercise in exercises:
         if names.count(exercise.name) > 1:
             raise InputError(f"two exercises are called {exercise.name!r}; names must differ")
-        if not grid.contains(exercise.landmarks).all():
-            x0, x1, y0, y1 = grid.extent
+        if any(outside(place) for place in exercise.landmarks):
             raise InputError(
-                f"exercise {exercise.name!r}: target and vessels must lie in the image, "
-                f"x from {x0:g} to {x1:g} and y from {y0:g} to {y1:g} mm"
+                f"exercise {exercise.name!r}: target and vessels must lie in the image, {axes} mm"
             )
-        for entry in _entries(exercise, grid):
-            if not grid.contains(entry).all():
-                x0, x1, y0, y1 = grid.extent
+        if exercise.entry_between is not None and len(low) == 3:
+            raise InputError(
+                f"exercise {exercise.name!r}: an entry is drawn by lot in the plane alone; in space give entry"
+            )
+        for entry in _entries(exercise, low):
+            if outside(entry):
+                came = ", ".join(f"{v:g}" for v in entry)
                 raise InputError(
-                    f"exercise {exercise.name!r}: the entry must lie in the image, "
-                    f"x from {x0:g} to {x1:g} and y from {y0:g} to {y1:g} mm; got {entry[0]:g}, {entry[1]:g}"
+                    f"exercise {exercise.name!r}: the entry must lie in the image, {axes} mm; got {came}"
                 )
 
 
-def _entries(exercise: Exercise, grid: RegularGrid) -> list[tuple[float, float]]:
+def _entries(exercise: Exercise, low: Sequence[float]) -> list[Sequence[float]]:
     """Return the entries between which an exercise lets its needle begin, mm."""
     if exercise.entry is not None:
         return [exercise.entry]
-    return [] if exercise.entry_between is None else [(x, grid.extent[2]) for x in exercise.entry_between]
+    return [] if exercise.entry_between is None else [(x, low[1]) for x in exercise.entry_between]
+
+
+def default_exercises_space(low: Sequence[float], high: Sequence[float]) -> tuple[Exercise, ...]:
+    """Return two exercises that fit any volume: their places are fractions of its extent."""
+    size = min(b - a for a, b in zip(low, high, strict=True))
+
+    def ball(u: float, v: float, w: float, share: float) -> Disc:
+        x, y, z = (a + part * (b - a) for a, b, part in zip(low, high, (u, v, w), strict=True))
+        return Disc(centre=(x, y, z), radius=share * size)
+
+    return (
+        Exercise(
+            name="in-space",
+            title="Find and hit the target",
+            goal="Find the target with the probe, keep the needle in the picture and bring the tip into the target.",
+            target=ball(0.55, 0.45, 0.5, 0.06),
+        ),
+        Exercise(
+            name="past-the-vessel-in-space",
+            title="Past the vessel",
+            goal="Reach the target behind the vessel without touching the vessel.",
+            target=ball(0.5, 0.6, 0.55, 0.06),
+            vessels=[ball(0.5, 0.35, 0.5, 0.09)],
+        ),
+    )
 
 
 def default_exercises(grid: RegularGrid) -> tuple[Exercise, ...]:

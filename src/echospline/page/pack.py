@@ -191,6 +191,13 @@ class Pack:
         )
         return RegularGrid((nx, ny), (dx, dy), (x, y))
 
+    @property
+    def corners(self) -> tuple[list[float], list[float]]:
+        """Least and greatest corner of the mesh, mm."""
+        m = self.manifest.mesh
+        last = [o + h * (n - 1) for o, h, n in zip(m.origin, m.spacing, m.shape, strict=True)]
+        return list(m.origin), last
+
     def model(self, name: str) -> ModelPart:
         """Return the model of a name.
 
@@ -330,10 +337,7 @@ def _check(pack: Pack) -> None:
     for key, value in _numbers(tables):
         if not isfinite(value):
             raise InputError(f"{key} of a pack must be a finite number; got {value}")
-    if pack.dimension == 2:
-        check_exercises(m.exercises, pack.mesh)
-    elif m.exercises:
-        raise InputError("a pack in space holds no exercises yet")
+    check_exercises(m.exercises, *pack.corners)
 
 
 def _check_shown(pack: Pack) -> str:
@@ -429,12 +433,8 @@ def _check_spatial(pack: Pack, model: ModelPart) -> None:
     """Refuse tables of a forced model in space that do not fit each other or the mesh."""
     from echospline.scenario import SpatialForcedScene  # noqa: PLC0415 - as above
 
-    mesh, response = pack.manifest.mesh, model.response or {}
-    corners = {
-        "low": mesh.origin,
-        "high": [o + h * (n - 1) for o, h, n in zip(mesh.origin, mesh.spacing, mesh.shape, strict=True)],
-    }
-    for name, wanted in corners.items():
+    response = model.response or {}
+    for name, wanted in zip(("low", "high"), pack.corners, strict=True):
         came = response.get(name)
         if not isinstance(came, list) or len(came) != 3 or not np.allclose(came, wanted, atol=1e-6):
             raise InputError(f"{name} of model {model.name!r} must be that of the mesh, {wanted}; got {came}")

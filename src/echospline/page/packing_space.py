@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echospline.errors import InputError
+from echospline.page.exercise import default_exercises_space
 from echospline.page.pack import (
     FORMAT,
     Manifest,
@@ -86,7 +87,7 @@ def packed_space(scene: SpatialScene, *, language: str = "en", rate: float = 120
         "needle": NeedlePart(
             entry=[float(v) for v in pose.entry], direction=axis.tolist(), lag=LAG, fastest=FASTEST, echo=echo.named()
         ),
-        "exercises": [],
+        "exercises": list(scenario.exercise) or list(default_exercises_space(*(c.tolist() for c in grid.corners))),
         "arrays": table(arrays),
     }  # fmt: skip
     return Pack(Manifest(**values), arrays)

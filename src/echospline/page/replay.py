@@ -9,14 +9,17 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from echospline.errors import InputError
 from echospline.live import Trace
+from echospline.page.exercise import check_exercises
 from echospline.page.pack import LARGEST, ModelPart, Pack, inflated
+from echospline.page.probe import in_picture
 from echospline.page.rules import broken_rules
 from echospline.page.scoring import Score, printed, prints_alike, score
 from echospline.page.sessions_file import RecordedSession
-from echospline.scene import Floats, NeedlePose
+from echospline.scene import Floats, NeedlePose, SpatialPose
 
 SLACK = 1e-6
 """mm and mm/s: how far rounding takes a recorded motion from what the hand's limits allow."""
@@ -132,14 +135,15 @@ def replay(pack: Pack, session: RecordedSession) -> Trace:
         )
     rows = session.rows(pack.dimension)
     tissue = tissue_of(pack, pack.model(session.model))
+    check_exercises([session.exercise], *pack.corners)
     places = np.array(session.exercise.landmarks, dtype=np.float64)
-    if not pack.mesh.contains(places).all():
-        raise InputError("target and vessels of this session's exercise lie outside the scene")
     dt = 1.0 / session.rate
     state = tissue.rest()
     watched = np.empty((len(rows), *places.shape))
-    for k, (x, y, tx, ty, speed) in enumerate(rows.tolist()):
-        state = tissue.advance(state, NeedlePose((x, y), (tx, ty), speed), dt)
+    D = pack.dimension
+    made: type[Any] = NeedlePose if D == 2 else SpatialPose
+    for k, row in enumerate(rows.tolist()):
+        state = tissue.advance(state, made(tuple(row[:D]), tuple(row[D : 2 * D]), row[-1]), dt)
         watched[k] = places + tissue.displacement_at(state, places)
     return Trace(dt, rows, watched)
 
@@ -156,7 +160,7 @@ def verify(pack: Pack, session: RecordedSession) -> Verified:
         If it cannot be run again at all.
     """
     trace = replay(pack, session)
-    found = score(trace, session.exercise)
+    found = score(trace, session.exercise, _seen(pack, session, trace))
     said = [
         *_of_another_exercise(pack, session),
         *impossible_motion(trace, pack.manifest.needle.fastest),
@@ -208,6 +212,17 @@ def impossible_motion(trace: Trace, fastest: float) -> list[str]:
             f"the speed in step {row} is said to be {trace.poses[row, -1]:.2f} mm/s, and its poses give {speed[row - 1]:.2f}"
         )
     return said
+
+
+def _seen(pack: Pack, session: RecordedSession, trace: Trace) -> NDArray[np.bool_] | None:
+    """Return at which steps the tip was in the picture; None in the plane."""
+    probe = pack.manifest.probe
+    if probe is None:
+        return None
+    planes = session.plane_rows() if session.planes else np.array([[0.0, *probe.pose]])
+    if len(planes) == 0 or (len(trace) and planes[-1, 0] >= len(trace)):
+        raise InputError("planes of a session begin at step 0 and end before its last step")
+    return in_picture(probe, planes, trace.tip)
 
 
 def _of_another_exercise(pack: Pack, session: RecordedSession) -> list[str]:

@@ -46,9 +46,8 @@ def _moved_entry(exercise: Exercise, trace: Trace) -> list[str]:
     if np.abs(trace.entry - first).max() > SAME:
         return ["the entry moved; the exercise gives it"]
     if exercise.entry is not None and np.abs(first - exercise.entry).max() > SAME:
-        return [
-            f"the needle entered at {first[0]:.2f}, {first[1]:.2f} mm; the exercise says {exercise.entry[0]:g}, {exercise.entry[1]:g}"
-        ]
+        came, given = (", ".join(f"{v:.2f}" for v in place) for place in (first, exercise.entry))
+        return [f"the needle entered at {came} mm; the exercise says {given}"]
     if exercise.entry_between is not None:
         low, high = exercise.entry_between
         if not low - SAME <= first[0] <= high + SAME:

@@ -1,4 +1,4 @@
-"""Scores of a recorded insertion: the metrics of the Perk Tutor, in the imaging plane.
+"""Scores of a recorded insertion: the metrics of the Perk Tutor, in the imaging plane or in space.
 
 Definitions follow PerkTutor/PythonMetrics where it has them: path inefficiency is 100 (path / straight - 1) per
 cent, tissue damage the area that the shaft sweeps inside the tissue, motion smoothness the root of the
@@ -23,6 +23,8 @@ INSIDE = 0.5
 """mm; a needle this deep is in the tissue."""
 TURN, TURN_REST = 3.0, 0.5
 """degrees that make a redirection; and s of a steady direction that end it."""
+STEADY = 0.01
+"""degrees between two steps of a steady direction."""
 LEAST = 0.005
 """Of any unit; less is printed as 0."""
 JERK_INTERVAL = 0.05
@@ -60,6 +62,8 @@ class Score:
         Displacement of the target at the end.
     vessel_contacts : int
         Times the needle touched a vessel.
+    picture_time : float or None
+        In space: how long the tip was in the picture while the needle was in the tissue; None in the plane, where it always is.
     """
 
     passed: bool
@@ -74,14 +78,31 @@ class Score:
     final_error: float
     target_shift: float
     vessel_contacts: int
+    picture_time: float | None = None
 
     def to_dict(self) -> dict[str, float | int | bool | None]:
-        """Return plain values for JSON; an infinite one is None."""
-        return {k: (None if isinstance(v, float) and not isfinite(v) else v) for k, v in asdict(self).items()}
+        """Return plain values for JSON; an infinite one is None, and what the plane does not have is left out."""
+        values = {
+            k: (None if isinstance(v, float) and not isfinite(v) else v) for k, v in asdict(self).items()
+        }
+        return (
+            values
+            if self.picture_time is not None
+            else {k: v for k, v in values.items() if k != "picture_time"}
+        )
 
 
-def score(trace: Trace, exercise: Exercise) -> Score:
+def score(trace: Trace, exercise: Exercise, seen: NDArray[np.bool_] | None = None) -> Score:
     """Score a trace; a pure function, so that stored sessions can be scored again.
+
+    Parameters
+    ----------
+    trace : Trace
+        In the plane or in space.
+    exercise : Exercise
+        What was to be done.
+    seen : ndarray of bool, shape (n,), optional
+        In space: at which steps the tip was in the picture.
 
     Raises
     ------
@@ -93,16 +114,16 @@ def score(trace: Trace, exercise: Exercise) -> Score:
             f"a trace of this exercise watches {1 + len(exercise.vessels)} places; got {trace.watched.shape[1]}"
         )
     if len(trace) == 0:
-        return Score(False, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0, 0.0, inf, 0.0, 0)
+        return Score(False, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0, 0.0, inf, 0.0, 0, None if seen is None else 0.0)
     inside = trace.depth > INSIDE
-    moves = np.hypot(*np.diff(trace.tip, axis=0).T)
+    moves = _length(np.diff(trace.tip, axis=0))
     within = inside[1:] & inside[:-1]
     path = float(moves[within].sum())
     touched = [
         contacts(trace.entry, trace.tip, trace.watched[:, 1 + j], vessel.radius, inside)
         for j, vessel in enumerate(exercise.vessels)
     ]
-    error = float(np.hypot(*(trace.tip[-1] - trace.watched[-1, 0]))) if inside[-1] else inf
+    error = float(_length(trace.tip[-1] - trace.watched[-1, 0])) if inside[-1] else inf
     turned = redirections(trace, inside)
     limit = inf if exercise.most_redirections is None else exercise.most_redirections
     return Score(
@@ -116,8 +137,9 @@ def score(trace: Trace, exercise: Exercise) -> Score:
         redirections=turned,
         smoothness=smoothness(trace),
         final_error=error,
-        target_shift=float(np.hypot(*(trace.watched[-1, 0] - np.array(exercise.target.centre)))),
+        target_shift=float(_length(trace.watched[-1, 0] - np.array(exercise.target.centre))),
         vessel_contacts=sum(touched),
+        picture_time=None if seen is None else trace.period * float((inside & seen).sum()),
     )
 
 
@@ -169,26 +191,46 @@ def swept_area(trace: Trace) -> Floats:
 
 def _triangle(a: Floats, b: Floats, c: Floats) -> Floats:
     u, v = b - a, c - a
+    if u.shape[1] == 3:
+        return 0.5 * _length(np.cross(u, v))
     area: Floats = 0.5 * np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
     return area
+
+
+def _length(vectors: Floats) -> Floats:
+    """Length of each vector, mm."""
+    length: Floats = np.hypot(vectors[..., 0], vectors[..., 1])
+    return length if vectors.shape[-1] == 2 else np.hypot(length, vectors[..., 2])
 
 
 def redirections(trace: Trace, inside: NDArray[np.bool_]) -> int:
     """Count the turns inside the tissue by more than `TURN` degrees; one turn lasts until the needle holds still."""
     along = trace.tip - trace.entry
     angle = np.degrees(np.unwrap(np.arctan2(along[:, 1], along[:, 0])))
+
+    def between(row: int, other: int) -> float:
+        """Degrees between the directions of two rows."""
+        if trace.dimension == 2:
+            return float(abs(angle[row] - angle[other]))
+        return _angle(along[row], along[other])
+
     rest_rows = max(1, round(TURN_REST / trace.period))
-    count, held, turning, still = 0, 0.0, False, 0
+    count, held, turning, still = 0, 0, False, 0
     for row in range(len(trace)):
-        if not inside[row] or (row and not inside[row - 1]):
-            held, turning, still = angle[row], False, 0
+        if row == 0 or not inside[row] or not inside[row - 1]:
+            held, turning, still = row, False, 0
             continue
-        still = still + 1 if abs(angle[row] - angle[row - 1]) < 0.01 else 0
-        if not turning and abs(angle[row] - held) > TURN:
+        still = still + 1 if between(row, row - 1) < STEADY else 0
+        if not turning and between(row, held) > TURN:
             count, turning = count + 1, True
         if still >= rest_rows:
-            held, turning = angle[row], False
+            held, turning = row, False
     return count
+
+
+def _angle(a: Floats, b: Floats) -> float:
+    """Angle between two directions in space, degrees."""
+    return float(np.degrees(np.arctan2(_length(np.cross(a, b)), a @ b)))
 
 
 def contacts(entry: Floats, tip: Floats, centres: Floats, radius: float, inside: NDArray[np.bool_]) -> int:
@@ -196,7 +238,7 @@ def contacts(entry: Floats, tip: Floats, centres: Floats, radius: float, inside:
     along = tip - entry
     length2 = np.maximum((along**2).sum(axis=1), 1e-12)
     t = np.clip(((centres - entry) * along).sum(axis=1) / length2, 0.0, 1.0)
-    nearest = np.hypot(*(entry + t[:, None] * along - centres).T)
+    nearest = _length(entry + t[:, None] * along - centres)
     return _rises(inside & (nearest <= radius))
 
 
@@ -207,7 +249,7 @@ def smoothness(trace: Trace) -> float:
     if blocks < 4:
         return 0.0
     dt = rows * trace.period
-    tip = trace.tip[: blocks * rows].reshape(blocks, rows, 2).mean(axis=1)
+    tip = trace.tip[: blocks * rows].reshape(blocks, rows, trace.dimension).mean(axis=1)
     jerk = np.diff(tip, n=3, axis=0) / dt**3
     return float(np.sqrt((jerk**2).sum() * dt))
 
@@ -220,5 +262,5 @@ def _inefficiency(trace: Trace, inside: NDArray[np.bool_], path: float) -> float
     rows = np.flatnonzero(inside)
     if len(rows) == 0:
         return 0.0
-    straight = float(np.hypot(*(trace.tip[rows[-1]] - trace.tip[rows[0]])))
+    straight = float(_length(trace.tip[rows[-1]] - trace.tip[rows[0]]))
     return 100.0 * (path / straight - 1.0) if straight > INSIDE else inf

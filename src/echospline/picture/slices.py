@@ -322,6 +322,7 @@ class SliceDrawing:
         grid = probe.grid
         columns, rows = grid.shape
         self._lattice = lattice_of(probe)
+        self._hides = not bool(probe.mask.all())
         self._spread = probe.thickness(grid.y) if probe.elevation > 0 else None
         span = ((columns - 1) * grid.spacing[0], (rows - 1) * grid.spacing[1])
         blank: Pixels = np.zeros((rows, columns), np.uint8)
@@ -333,7 +334,7 @@ class SliceDrawing:
     def draw(
         self,
         plane: ImagingPlane,
-        field: Field | None = None,
+        field: Field | CoreField | None = None,
         pose: SpatialPose | None = None,
         needle: NeedleEcho | None = None,
     ) -> SliceDrawn:
@@ -365,7 +366,8 @@ class SliceDrawing:
         if pose is not None and needle is not None and pose.depth >= ZERO_LENGTH:
             self._picture.reference(pixels)
             pixels = self._picture.draw(needle.between(*pose.seen_from(plane), apex=self.probe.apex))
-            pixels[~self.probe.mask] = 0
+            if self._hides:
+                np.multiply(pixels, self.probe.mask, out=pixels)
         done = perf_counter()
         return SliceDrawn(
             UltrasoundImage(pixels, grid, self.volume.source),
@@ -381,7 +383,7 @@ class SliceDrawing:
         )
 
     def _undo(
-        self, places: Floats, field: Field, pose: SpatialPose | None
+        self, places: Floats, field: Field | CoreField, pose: SpatialPose | None
     ) -> tuple[Floats, float, SpatialFolds | None]:
         """Return origins of the lattice, the residual midway between its points, and folds."""
         pixel = min(self.probe.grid.spacing)

@@ -41,6 +41,8 @@ PerLength = Annotated[float, _in_unit("N/mm")]
 PerArea = Annotated[float, _in_unit("N/mm^2")]
 Kilopascals = Annotated[float, _in_unit("kPa")]
 Point = tuple[Millimetres, Millimetres]
+Place = Point | tuple[Millimetres, Millimetres, Millimetres]
+"""Of the plane, or in space."""
 
 
 class Section(BaseModel):
@@ -398,9 +400,9 @@ EchoKind = Literal["hypoechoic", "anechoic", "hyperechoic"]
 
 
 class DiscSection(Section):
-    """A round structure; it moves with the tissue."""
+    """A round structure, in space a ball; it moves with the tissue."""
 
-    centre: Point = Field(description="where it lies at rest (x lateral, y depth), mm")
+    centre: Place = Field(description="where it lies at rest (x lateral, y depth, in space z elevation), mm")
     radius: Millimetres = Field(gt=0, le=100, description="mm")
     imaged: bool = Field(
         False, description="the picture shows it as a scanner would: a target hypoechoic, a vessel anechoic"
@@ -438,7 +440,7 @@ class ExerciseSection(Section):
         True,
         description="rings, guide line and readouts may be shown; false: not while the exercise is recorded",
     )
-    entry: Point | None = Field(
+    entry: Place | None = Field(
         None, description="the needle enters here, mm; where not given, the trainee chooses"
     )
     entry_between: tuple[Millimetres, Millimetres] | None = Field(
@@ -460,6 +462,6 @@ class ExerciseSection(Section):
         return self
 
     @property
-    def landmarks(self) -> list[tuple[float, float]]:
+    def landmarks(self) -> list[Place]:
         """Centres of target and vessels at rest, mm: the points watched while the tissue moves."""
         return [self.target.centre, *(vessel.centre for vessel in self.vessels)]

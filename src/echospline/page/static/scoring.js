@@ -111,13 +111,13 @@ export function redirectionsOf(trace, inside) {
   const rest = Math.max(1, roundHalfEven(TURN_REST / trace.period)), found = [], between = turnsOf(trace);
   let held = 0, turning = false, still = 0;
   for (let row = 0; row < inside.length; ++row) {
-    if (!inside[row] || (row && !inside[row - 1])) {
+    if (!row || !inside[row] || !inside[row - 1]) {
       held = row;
       turning = false;
       still = 0;
       continue;
     }
-    still = row && between(row, row - 1) < STEADY ? still + 1 : 0;
+    still = between(row, row - 1) < STEADY ? still + 1 : 0;
     if (!turning && between(row, held) > TURN) {
       found.push(row);
       turning = true;
