@@ -45,6 +45,10 @@ SliceFormer = Callable[[ImagingPlane, Probe, Field | None, int], UltrasoundImage
 class CoreField(Protocol):
     """A displacement that the core can sum itself: planes are then traced back there."""
 
+    def __call__(self, points: Floats, /) -> Floats:
+        """Displacement (n, 3) mm of reference points (n, 3) mm."""
+        ...
+
     def in_core(self) -> tuple[space.ForceField, list[Floats]]:
         """Return the field as the core takes it, and the arrays that it points to."""
         ...
@@ -323,7 +327,7 @@ class SliceDrawing:
 
     def __init__(self, volume: Volume, probe: Probe, form_image: SliceFormer | None = None) -> None:
         self.volume, self.probe, self._former = volume, probe, form_image
-        self._voxels = None if form_image else NativeVolume(volume)
+        self._voxels = NativeVolume(volume)
         grid = probe.grid
         columns, rows = grid.shape
         self._lattice = lattice_of(probe)
@@ -367,13 +371,12 @@ class SliceDrawing:
             X, residual, folds = self._undo(places, field, pose)
         inverse = perf_counter()
         shape = (*lattice.shape[::-1], 3)
-        if self._voxels is not None:
+        if self._former is None:
             pixels, beyond = self._voxels.slice(
                 X.reshape(shape), grid.shape, STEP, plane.matrix[:3, 2], self._spread, self.probe.mask
             )
             outside = beyond / max(int(self.probe.mask.sum()), 1)
         else:
-            assert self._former is not None
             pixels = self._former(plane, self.probe, field, index).pixels
             seen = self.probe.sees(lattice.nodes)
             outside = 1.0 - float(self.volume.contains(X[seen]).mean()) if seen.any() else 0.0
