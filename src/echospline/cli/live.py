@@ -129,7 +129,7 @@ def live(
     if scenario_room.is_spatial(scenario):
         if link or link_connect:
             raise InputError("live follows a tracker in scenes of the plane alone: leave --link out in space")
-        opened = scenario_room.open_spatial(scenario, folder)
+        opened = scenario_room.open_spatial(scenario, folder, own=False)
         say(opened.notes, "note")
         scene = viewer.Scene(page_room.packed_space(opened, language=language, rate=rate))
     else:
@@ -137,6 +137,7 @@ def live(
         say([*image.notes, *scenario.label_notes(folder)], "note")
         say(scenario_room.size_doubts(image.grid))
         scene = scene_of(scenario, image, folder, language=language, rate=rate)
+    say(page_room.doubts(scenario, scene.pack), "note")
     opener = None if opened is not None else opener_for(scenario, language=language, rate=rate)
     settings = viewer.Settings(host, port, clients, origins=tuple(origin or ()), open_door=not token)
     console = Console(stderr=True)

@@ -34,7 +34,7 @@ def page(
     """
     scenario, folder = scenario_from(source, changes or {})
     if scenario_room.is_spatial(scenario):
-        opened = scenario_room.open_spatial(scenario, folder)
+        opened = scenario_room.open_spatial(scenario, folder, own=False)
         say(opened.notes, "note")
         pack = page_room.packed_space(opened, language=language, rate=rate)
     else:
@@ -42,6 +42,7 @@ def page(
         say([*image.notes, *scenario.label_notes(folder)], "note")
         say(scenario_room.size_doubts(image.grid))
         pack = page_room.packed(scenario, image, folder, language=language, rate=rate)
+    say(page_room.doubts(scenario, pack), "note")
     html = page_room.bundle(pack)
     data = html.encode()
     with appearing(out) as part:

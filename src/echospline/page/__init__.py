@@ -8,7 +8,7 @@ if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.page.bundle import assembled, bundle, core_bytes, served_page
     from echospline.page.exercise import Disc, Exercise, check_exercises, default_exercises
     from echospline.page.pack import Pack
-    from echospline.page.packing import packed
+    from echospline.page.packing import doubts, packed
     from echospline.page.packing_space import packed_space
     from echospline.page.replay import Verified, pack_of_page, replay, verify
     from echospline.page.rules import beyond, broken_rules
@@ -31,6 +31,7 @@ __all__ = [
     "check_exercises",
     "core_bytes",
     "default_exercises",
+    "doubts",
     "pack_of_page",
     "packed",
     "packed_space",

@@ -95,6 +95,16 @@ def packed(
     return Pack(Manifest(**values), arrays)
 
 
+def doubts(scenario: Scenario, pack: Pack) -> list[str]:
+    """Say in a sentence where a page does not begin with the scenario's own model."""
+    asked, first = scenario.model.kind, pack.manifest.models[0]
+    if asked == first.name:
+        return []
+    return [
+        f"model.kind = {asked} is not among what a page computes for this scene; it begins with {first.label}"
+    ]
+
+
 def grey(image: UltrasoundImage) -> NDArray[np.uint8]:
     """Return 8-bit grey pixels, shape (rows, columns): colour by its brightness.
 
@@ -115,6 +125,10 @@ def _models(
     scenario: Scenario, grid: RegularGrid, folder: Path, arrays: dict[str, NDArray[Any]]
 ) -> list[ModelPart]:
     """Pack the models, the scenario's own first; their arrays are added to ``arrays``."""
+    if scenario.model.mechanics == "space":
+        raise InputError(
+            'a page computes a picture by plane elasticity; model.mechanics = "space" asks for a slab: leave it out here, or use simulate'
+        )
     parts = []
     green = forced_scene(scenario, grid, folder)
     kinds = ("tps", "elastic") if green is None else ("green", "tps", "elastic")

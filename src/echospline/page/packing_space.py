@@ -127,4 +127,9 @@ def _models(scene: SpatialScene, grid: SpatialGrid, arrays: dict[str, NDArray[An
                 named[role] = f"{kind}.{role}"
                 arrays[named[role]] = np.array(array, dtype=NARROW.get(role, array.dtype))
         parts.append(ModelPart(name=kind, label=LABELS[kind], sentence=SENTENCES[kind], arrays=named, **more))
+    if not parts:
+        raise InputError(
+            "a page answers homogeneous tissue in space (green), or landmarks in a volume that is small enough (elastic); this scene has "
+            "regions and is too large for elastic: leave its regions out, or --tissue homogeneous"
+        )
     return parts

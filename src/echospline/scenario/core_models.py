@@ -133,6 +133,8 @@ def spatial_scene(
     InputError
         If its parameters are invalid, or the mesh is too large for it.
     """
+    if kind == "green" and tissue.regions:  # before elements are set up in vain
+        return None
     model = build_spatial_model(scenario, grid, tissue, kind=kind)
     if isinstance(model, SpatialLandmarkModel):
         return model.native.scene

@@ -50,8 +50,18 @@ def is_spatial(scenario: Scenario) -> bool:
     return scenario.space is not None or scenario.image.file in SAMPLES
 
 
-def open_spatial(scenario: Scenario, folder: Path) -> SpatialScene:
+def open_spatial(scenario: Scenario, folder: Path, *, own: bool = True) -> SpatialScene:
     """Read the volume of a scenario, turn its depth along y and choose a window where its voxels need one.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        A scene in space.
+    folder : Path
+        Start of its relative paths.
+    own : bool
+        Whether a volume that knows the stiffness of its tissues gives it to a scenario that asks for none; without, such a scenario is
+        homogeneous, as hosts of the core need it.
 
     Raises
     ------
@@ -82,7 +92,13 @@ def open_spatial(scenario: Scenario, folder: Path) -> SpatialScene:
         )
     volume, space, said = _windowed(volume, space)
     notes += said
-    own = _takes_own(scenario, space, known=made is not None)
+    known = made is not None
+    if known and not own and space.tissue is None:
+        space = space.model_copy(update={"tissue": "homogeneous"})
+        notes.append(
+            f"tissue is homogeneous here, {scenario.tissue.young:g} kPa; simulate takes the modulus of each tissue of {name}"
+        )
+    own = _takes_own(scenario, space, known=known)
     space = space.model_copy(update={"tissue": "own" if own else "homogeneous"})
     if scenario.has_bodies:
         from echospline.laboratory import imaged_volume  # noqa: PLC0415

@@ -98,7 +98,7 @@ class Extent:
 FULL = Extent()
 QUICK = Extent(
     nodes=(40, 30), steps=10, node_counts=(500, 1200, 2500, 4500), seconds=0.15, literal_nodes=1_300,
-    runs=64, frames=5, radii=(1.0,), cell=4.5,
+    runs=64, frames=5, radii=(1.0,), cell=4.0,
 )  # fmt: skip
 
 
