@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from echospline.scenario.space_models import build_spatial_model
 from echospline.scenario.space_scene import spatial_tissue
 from echospline.scene import NeedlePose, Probe, SpatialPose, Volume, probe_plane
 from test_page_pack import changed, put
+from test_page_replay import NODE, WASM
 
 RNG = np.random.default_rng(9)
 

@@ -11,7 +11,7 @@ import { printed, wordsOf } from "./words.js";
 /** @typedef {(key: string, values?: Record<string, string | number>) => string} Words */
 
 const METRICS = /** @type {[keyof Score, string][]} */ ([
-  ["final_error", "mm"], ["target_shift", "mm"], ["time", "s"], ["tissue_time", "s"], ["path_length", "mm"], ["path_inefficiency", "%"], ["tissue_damage", "mm²"],
+  ["final_error", "mm"], ["target_shift", "mm"], ["time", "s"], ["tissue_time", "s"], ["picture_time", "s"], ["path_length", "mm"], ["path_inefficiency", "%"], ["tissue_damage", "mm²"],
   ["punctures", ""], ["redirections", ""], ["vessel_contacts", ""], ["smoothness", "mm/s²·⁵"],
 ]);
 
@@ -53,7 +53,7 @@ export function showSummary(state, session, trace, expert, past) {
   put(verdict, say(score.passed ? "passed" : "failed"));
   verdict.className = score.passed ? "verdict passed" : "verdict failed";
   put(byId("why"), reasonOf(session, say));
-  byId("metrics").replaceChildren(...METRICS.map(([name, unit]) => {
+  byId("metrics").replaceChildren(...METRICS.filter(([name]) => score[name] !== undefined).map(([name, unit]) => {
     const value = score[name];
     return element("tr", {}, element("th", { textContent: say(name), scope: "row" }), element("td", { textContent: value === null ? "–" : `${printed(Number(value))} ${unit}` }));
   }));

@@ -169,7 +169,7 @@ function stepOn(dt) {
     ++counts.steps;
     if (served && since.length < MOST_SINCE) since.push(...Array.from(pose.entry).slice(0, state.low.length), ...Array.from(pose.tip).slice(0, state.low.length), pose.speed);
     if (!attempt || !state.run) continue;
-    attempt.add(pose, watchedNow(attempt.places));
+    attempt.add(pose, watchedNow(attempt.places), engine.plane);
     if (attempt.steps >= Math.round(attempt.exercise.time_limit * state.rate)) {
       due = 0;
       finish("time");
@@ -233,7 +233,7 @@ function start() {
   if (!state.run) return;
   const trainee = inputOf("trainee").value.trim(), { exercise, examination } = state.run;
   renew();
-  attempt = new Attempt(exercise, state.rate, state.model, examination, trainee, new Date());
+  attempt = new Attempt(exercise, state.rate, state.model, examination, trainee, new Date(), engine.pack.probe);
   attemptNumber = 1 + attemptsMade(store.sessions, exercise.name, trainee);
   drawnState = null;
 }
@@ -273,7 +273,7 @@ function summarise(session, trace) {
 /** The trace of a kept attempt, by running it again. @param {Session} session @returns {Trace} */
 function retraced(session) {
   const poses = posesOf(session), places = landmarksOf(session.exercise);
-  return { period: 1 / session.rate, poses, watched: engine.retrace(session.model, poses, session.rate, places), places: places.length / 2 };
+  return { period: 1 / session.rate, poses, watched: engine.retrace(session.model, poses, session.rate, places), places: places.length / engine.pack.dimension, dimension: engine.pack.dimension };
 }
 
 /** Whether this scene can show a session; says why not. @param {Session} session */

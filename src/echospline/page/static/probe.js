@@ -13,6 +13,7 @@ import { PackError, asNumber, asNumbers, asRecord, asWhole } from "./checked.js"
 
 export const MOST_TILT = 45; // degrees
 const LARGEST_PICTURE = 2048 * 2048;
+const SEEN_SIGMAS = 2, SEEN_LEAST = 0.5; // sigma of the slice, and mm, that a place may lie off the plane and is still in the picture, as in Python
 
 /** @param {unknown} value @returns {Probe} */
 export function readProbe(value) {
@@ -84,6 +85,16 @@ export function heldBetween([x, y, z, yaw, pitch, roll], low, high) {
   return [
     within(x, low[0], high[0]), y, within(z, low[2], high[2]), ((((yaw + 180) % 360) + 360) % 360) - 180, within(pitch, -MOST_TILT, MOST_TILT), within(roll, -MOST_TILT, MOST_TILT),
   ];
+}
+
+/** Whether a place of the scene is in the picture: in reach of the beams, and no further off the plane than the slice is thick. @param {Probe} probe @param {ProbePose} pose @param {ArrayLike<number>} place mm */
+export function inPicture({ shape, columns, rows, spacing, origin, radius, opening, depth, elevation, elevation_depth, element_height }, pose, place) {
+  const [x, y, off] = lowered(planeMatrix(pose), place), half = 1e-9 + spacing[0] / 2, r = Math.hypot(x, y + radius);
+  const reached = shape === "linear"
+    ? x >= origin[0] - spacing[0] / 2 && x <= origin[0] + (columns - 0.5) * spacing[0] && y >= origin[1] - spacing[1] / 2 && y <= origin[1] + (rows - 0.5) * spacing[1]
+    : r >= radius - half && r <= radius + depth + half && Math.atan2(Math.abs(x), y + radius) <= (opening / 2) * (Math.PI / 180) + 1e-9;
+  const sigma = elevation === 0 ? 0 : Math.hypot(((Math.max(0, y) - elevation_depth) * element_height) / (2.5 * elevation_depth), elevation);
+  return reached && Math.abs(off) <= Math.max(SEEN_SIGMAS * sigma, SEEN_LEAST);
 }
 
 /** Which pixels the beams reach, 0 or 1; null where all are. @param {Probe} probe @returns {Uint8Array | undefined} */

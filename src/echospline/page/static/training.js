@@ -2,9 +2,11 @@
 
 import { decoded, inBase64 } from "./bytes.js";
 import { PackError, asList, asNumber, asRecord, asText, asWhole } from "./checked.js";
+import { inPicture } from "./probe.js";
 import { readExercise } from "./scene.js";
-import { ROW, contactsOf, insideOf, redirectionsOf, rowsOf, scoreOf, watchedAt } from "./scoring.js";
+import { contactsOf, insideOf, redirectionsOf, rowSize, rowsOf, scoreOf, tipAt, watchedAt } from "./scoring.js";
 
+/** @import { Probe, ProbePose } from "./probe.js" */
 /** @import { Exercise } from "./scene.js" */
 /** @import { Score, Trace } from "./scoring.js" */
 /** @typedef {[number, string]} Happening step and kind */
@@ -18,13 +20,15 @@ import { ROW, contactsOf, insideOf, redirectionsOf, rowsOf, scoreOf, watchedAt }
  */
 /** What made a session. @typedef {{ version: string, core: string, title: string, pack: string }} Origin */
 
+const PLANE = 7; // numbers of a row of planes: step, x, y, z, yaw, pitch, roll
+const IN_BASE64 = /^[A-Za-z0-9+/]*={0,2}$/;
 const MOST_SESSIONS = 5000, MOST_STEPS = 2_000_000, MOST_EVENTS = 10_000;
 const SHARE = "echospline session", SEVERAL = "echospline sessions";
 
 /** Collects an attempt; a row is a step. */
 export class Attempt {
-  /** @param {Exercise} exercise @param {number} rate steps per second @param {string} model @param {boolean} examination @param {string} trainee @param {Date} started */
-  constructor(exercise, rate, model, examination, trainee, started) {
+  /** @param {Exercise} exercise @param {number} rate steps per second @param {string} model @param {boolean} examination @param {string} trainee @param {Date} started @param {Probe | null} [probe] of a scene in space */
+  constructor(exercise, rate, model, examination, trainee, started, probe = null) {
     this.exercise = exercise;
     this.rate = rate;
     this.model = model;
@@ -35,6 +39,13 @@ export class Attempt {
     this.poses = [];
     /** @type {number[]} */
     this.watched = [];
+    this.probe = probe;
+    /** Rows of [step, pose] at which the probe was moved. @type {number[]} */
+    this.planes = [];
+    /** @type {ProbePose | null} */
+    this.held = null;
+    /** @type {number[]} */
+    this.seen = [];
     this.steps = 0;
   }
 
@@ -43,16 +54,25 @@ export class Attempt {
     return landmarksOf(this.exercise);
   }
 
-  /** @param {{ entry: ArrayLike<number>, tip: ArrayLike<number>, speed: number }} pose @param {ArrayLike<number>} watched */
-  add({ entry, tip, speed }, watched) {
-    this.poses.push(entry[0], entry[1], tip[0], tip[1], speed);
+  /** @param {{ entry: ArrayLike<number>, tip: ArrayLike<number>, speed: number }} pose @param {ArrayLike<number>} watched @param {ProbePose | null} [held] where the probe is */
+  add({ entry, tip, speed }, watched, held = null) {
+    for (const place of [entry, tip]) for (let d = 0; d < this.exercise.target.centre.length; ++d) this.poses.push(place[d]);
+    this.poses.push(speed);
+    if (this.probe && held) {
+      if (held.some((value, k) => value !== this.held?.[k])) this.planes.push(this.steps, ...held);
+      this.held = held;
+      this.seen.push(Number(inPicture(this.probe, held, tip)));
+    }
     for (let k = 0; k < watched.length; ++k) this.watched.push(watched[k]);
     ++this.steps;
   }
 
   /** @returns {Trace} */
   get trace() {
-    return { period: 1 / this.rate, poses: Float64Array.from(this.poses), watched: Float64Array.from(this.watched), places: 1 + this.exercise.vessels.length };
+    return {
+      period: 1 / this.rate, poses: Float64Array.from(this.poses), watched: Float64Array.from(this.watched), places: 1 + this.exercise.vessels.length,
+      dimension: this.exercise.target.centre.length, seen: this.probe ? Uint8Array.from(this.seen) : null,
+    };
   }
 
   /** @param {"finished" | "reset" | "time"} ended @param {number} attempt @param {Origin} origin @returns {Session} */
@@ -61,14 +81,14 @@ export class Attempt {
     return {
       format: 1, kind: SHARE, version: origin.version, core: origin.core, scene: { title: origin.title, pack: origin.pack }, model: this.model,
       exercise: this.exercise, examination: this.examination, trainee: this.trainee, attempt, started: this.started.toISOString(), rate: this.rate, ended,
-      steps: this.steps, poses: inBase64(trace.poses), planes: null, events: eventsOf(trace, this.exercise), score: scoreOf(trace, this.exercise),
+      steps: this.steps, poses: inBase64(trace.poses), planes: this.planes.length ? inBase64(Float64Array.from(this.planes)) : null, events: eventsOf(trace, this.exercise), score: scoreOf(trace, this.exercise),
     };
   }
 }
 
 /** Centres of target and vessels at rest, flat, mm. @param {Exercise} exercise */
 export function landmarksOf(exercise) {
-  return [exercise.target, ...exercise.vessels].flatMap((ball) => ball.centre.slice(0, 2));
+  return [exercise.target, ...exercise.vessels].flatMap((ball) => ball.centre);
 }
 
 /** What happened at which step. @param {Trace} trace @param {Exercise} exercise @returns {Happening[]} */
@@ -92,21 +112,21 @@ export function eventsOf(trace, exercise) {
 
 /** Tip to the deformed target's centre, mm. @param {Trace} trace @param {number} row */
 export function distanceAt(trace, row) {
-  const [x, y] = watchedAt(trace, row, 0);
-  return Math.hypot(trace.poses[ROW * row + 2] - x, trace.poses[ROW * row + 3] - y);
+  const centre = watchedAt(trace, row, 0);
+  return Math.hypot(...Array.from(tipAt(trace, row), (value, d) => value - centre[d]));
 }
 
 /** Depth and distance to the target over time, thinned for a plot. @param {Trace} trace @param {number} [most] points */
 export function plotOf(trace, most = 400) {
   const n = rowsOf(trace), stride = Math.max(1, Math.ceil(n / most));
-  const rows = Array.from({ length: Math.ceil(n / stride) }, (_, k) => k * stride), p = trace.poses;
+  const rows = Array.from({ length: Math.ceil(n / stride) }, (_, k) => k * stride), { poses: p, dimension: D } = trace, size = rowSize(D);
   return {
     time: rows.map((row) => row * trace.period), distance: rows.map((row) => distanceAt(trace, row)),
-    depth: rows.map((row) => Math.hypot(p[ROW * row + 2] - p[ROW * row], p[ROW * row + 3] - p[ROW * row + 1])),
+    depth: rows.map((row) => Math.hypot(...Array.from({ length: D }, (_, d) => p[size * row + D + d] - p[size * row + d]))),
   };
 }
 
-/** Poses of a session, ROW numbers each. @param {Session} session @returns {Float64Array} */
+/** Poses of a session, row by row. @param {Session} session @returns {Float64Array} */
 export function posesOf(session) {
   return fromBase64(session.poses);
 }
@@ -132,8 +152,10 @@ export function readSession(value, what) {
   const s = asRecord(value, what);
   if (s.format !== 1 || s.kind !== SHARE) throw new PackError(`${what} is no session of format 1; export it again.`);
   const steps = asWhole(s.steps, `${what}.steps`, 0, MOST_STEPS), scene = asRecord(s.scene, `${what}.scene`);
-  const poses = asText(s.poses, `${what}.poses`, 8 * MOST_STEPS * ROW * 2);
-  if (!/^[A-Za-z0-9+/]*={0,2}$/.test(poses) || poses.length !== 4 * Math.ceil((8 * ROW * steps) / 3)) {
+  const centre = asRecord(asRecord(s.exercise, `${what}.exercise`).target, `${what}.exercise.target`).centre, dimension = Array.isArray(centre) && centre.length === 3 ? 3 : 2;
+  const poses = asText(s.poses, `${what}.poses`, 16 * MOST_STEPS * rowSize(dimension)), planes = s.planes === null || s.planes === undefined ? null : asText(s.planes, `${what}.planes`, 16 * MOST_STEPS * PLANE);
+  if (planes !== null && (!IN_BASE64.test(planes) || decoded(planes).length % (8 * PLANE))) throw new PackError(`${what}.planes are no rows of ${PLANE} numbers: the file is cut or changed.`);
+  if (!IN_BASE64.test(poses) || poses.length !== 4 * Math.ceil((8 * rowSize(dimension) * steps) / 3)) {
     throw new PackError(`${what} says ${steps} steps, but its poses are of another length: the file is cut or changed.`);
   }
   if (!fromBase64(poses).every(Number.isFinite)) throw new PackError(`${what} holds poses that are no finite numbers.`);
@@ -143,8 +165,8 @@ export function readSession(value, what) {
   return {
     format: 1, kind: SHARE, version: asText(s.version, `${what}.version`, 80), core: asText(s.core, `${what}.core`, 200),
     scene: { title: asText(scene.title, `${what}.scene.title`, 200), pack: asText(scene.pack, `${what}.scene.pack`, 200) }, model: asText(s.model, `${what}.model`, 40),
-    exercise: readExercise(s.exercise, `${what}.exercise`, 2), examination: s.examination === true, trainee: asText(s.trainee, `${what}.trainee`, 80),
-    attempt: asWhole(s.attempt, `${what}.attempt`, 0, 1e6), started, rate: asNumber(s.rate, `${what}.rate`, 10, 2000), ended: s.ended, steps, poses, planes: null,
+    exercise: readExercise(s.exercise, `${what}.exercise`, dimension), examination: s.examination === true, trainee: asText(s.trainee, `${what}.trainee`, 80),
+    attempt: asWhole(s.attempt, `${what}.attempt`, 0, 1e6), started, rate: asNumber(s.rate, `${what}.rate`, 10, 2000), ended: s.ended, steps, poses, planes,
     events: asList(s.events, `${what}.events`, 0, MOST_EVENTS).map((e) => {
       const pair = asList(e, `${what}.events`, 2, 2);
       return /** @type {Happening} */ ([asWhole(pair[0], `${what}.events`, 0, MOST_STEPS), asText(pair[1], `${what}.events`, 40)]);
@@ -161,7 +183,7 @@ function readScore(value, what) {
   return {
     passed: s.passed === true, time: n("time"), tissue_time: n("tissue_time"), path_length: n("path_length"), path_inefficiency: open("path_inefficiency"),
     tissue_damage: n("tissue_damage"), punctures: n("punctures"), redirections: n("redirections"), smoothness: n("smoothness"), final_error: open("final_error"),
-    target_shift: n("target_shift"), vessel_contacts: n("vessel_contacts"),
+    target_shift: n("target_shift"), vessel_contacts: n("vessel_contacts"), ...(s.picture_time === undefined ? {} : { picture_time: n("picture_time") }),
   };
 }
 

@@ -70,7 +70,7 @@ const TABLE = {
   "why-hit": ["the tip ended {error} mm from the target's centre", "die Spitze endete {error} mm von der Mitte des Ziels"],
   "why-vessel": ["a vessel was touched {count} times", "ein Gefäß wurde {count}-mal berührt"],
   "why-turns": ["{count} redirections, {most} allowed", "{count} Richtungswechsel, {most} erlaubt"],
-  "final_error": ["Tip to target", "Spitze zum Ziel"], "target_shift": ["Target moved by the tissue", "Ziel vom Gewebe bewegt"], "time": ["Time", "Zeit"], "tissue_time": ["Time in tissue", "Zeit im Gewebe"], "path_length": ["Path length", "Weglänge"],
+  "final_error": ["Tip to target", "Spitze zum Ziel"], "target_shift": ["Target moved by the tissue", "Ziel vom Gewebe bewegt"], "time": ["Time", "Zeit"], "tissue_time": ["Time in tissue", "Zeit im Gewebe"], "picture_time": ["Tip in the picture", "Spitze im Bild"], "path_length": ["Path length", "Weglänge"],
   "path_inefficiency": ["Path inefficiency", "Umweg"], "tissue_damage": ["Tissue damage (area swept)", "Gewebeschaden (überstrichene Fläche)"], "punctures": ["Punctures", "Einstiche"],
   "redirections": ["Redirections", "Richtungswechsel"], "vessel_contacts": ["Vessel contacts", "Gefäßberührungen"], "smoothness": ["Smoothness (less is smoother)", "Ruck (weniger ist ruhiger)"],
   "plot-distance": ["tip to target", "Spitze zum Ziel"], "plot-depth": ["depth", "Tiefe"], "plot-time": ["time, s", "Zeit, s"], "plot-radius": ["target radius", "Zielradius"], "plot-attempt": ["attempt", "Versuch"], "plot-expert": ["expert", "Experte"],
