@@ -641,7 +641,9 @@ def test_the_small_drawing_takes_the_probe_and_can_be_hidden(opened, volume_file
     assert np.abs(corner - shown[-200:, -250:]).mean() > 3
 
 
-def test_the_guide_says_where_a_needle_across_would_pass_and_the_numbers_how_far_off_it_is(opened, volume_file):
+def test_the_guide_says_where_a_needle_across_would_pass_and_the_numbers_how_far_off_it_is(
+    opened, volume_file
+):
     page = ready(opened(path=volume_file))
     push(page, 6)
     page.keyboard.press("z")

@@ -19,7 +19,8 @@ from test_page_browser import CHROMIUM, FLAGS, SECONDS, SIZES, WASM, depth, pict
 
 pytestmark = [
     pytest.mark.skipif(
-        CHROMIUM is None, reason="Chromium is not installed; run tests/install-system (needs apt-get and root)"
+        CHROMIUM is None,
+        reason="Chromium is not installed; run tests/install-system (needs apt-get and root)",
     ),
     pytest.mark.skipif(not WASM.exists(), reason="echospline.wasm is not built; run make wasm"),
 ]
@@ -108,7 +109,9 @@ def test_finite_elements_are_shown_on_request_and_the_difference_is_said(server,
 def test_a_file_is_opened_by_the_server_and_one_that_is_none_is_said(server, visit, tmp_path):
     page = visit(server[0])
     (tmp_path / "bad.png").write_bytes(b"not a picture")
-    Image.fromarray(np.random.default_rng(2).integers(0, 255, (64, 80), dtype=np.uint8)).save(tmp_path / "own.png")
+    Image.fromarray(np.random.default_rng(2).integers(0, 255, (64, 80), dtype=np.uint8)).save(
+        tmp_path / "own.png"
+    )
     page.locator('[data-do="open"]').click()
     page.locator("#open-file").set_input_files(tmp_path / "own.png")
     page.locator("#open-spacing").fill("0.2")

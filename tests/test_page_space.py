@@ -46,7 +46,9 @@ def opened(kind: str = "green", shape: str = "linear") -> SpatialScene:
     return SpatialScene(Scenario().with_values(values, "test"), smooth_volume(), Tissue(10.0, 0.45), ())
 
 
-@pytest.fixture(scope="module", params=[("green", "linear"), ("green", "curved"), ("elastic", "linear")], ids="-".join)
+@pytest.fixture(
+    scope="module", params=[("green", "linear"), ("green", "curved"), ("elastic", "linear")], ids="-".join
+)
 def case(request):
     kind, shape = request.param
     scene = opened(kind, shape)
@@ -142,7 +144,9 @@ def test_the_pages_engine_moves_tissue_and_draws_planes_as_the_package_does(case
                 NeedleEcho() if pose.depth > 1e-9 else None,
             ).image.pixels  # fmt: skip
             apart = np.abs(pictures[ends.index(k)].astype(int) - drawn.astype(int))
-            assert apart.max() <= 1, f"{apart.max()} grey levels at {np.unravel_index(apart.argmax(), apart.shape)}"
+            assert apart.max() <= 1, (
+                f"{apart.max()} grey levels at {np.unravel_index(apart.argmax(), apart.shape)}"
+            )
     assert moved > 0.1
 
 
@@ -157,7 +161,9 @@ def test_planes_of_the_page_are_those_of_the_package(tmp_path):
       return {{ m, back: poseOfMatrix(m), round: lowered(m, raised(m, p)), twice: planeMatrix(turnedBy(pose, [10, -5, k])) }};
     }})));"""
     (tmp_path / "planes.mjs").write_text(script)
-    done = subprocess.run([NODE, str(tmp_path / "planes.mjs")], capture_output=True, text=True, timeout=60, check=True)
+    done = subprocess.run(
+        [NODE, str(tmp_path / "planes.mjs")], capture_output=True, text=True, timeout=60, check=True
+    )
     for k, (pose, found) in enumerate(zip(poses, json.loads(done.stdout), strict=True)):
         matrix = probe_plane(pose[:3], *pose[3:]).matrix
         np.testing.assert_allclose(found["m"], matrix.ravel(), atol=1e-12)

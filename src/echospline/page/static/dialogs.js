@@ -11,8 +11,8 @@ import { printed, wordsOf } from "./words.js";
 /** @typedef {(key: string, values?: Record<string, string | number>) => string} Words */
 
 const METRICS = /** @type {[keyof Score, string][]} */ ([
-  ["final_error", "mm"], ["target_shift", "mm"], ["time", "s"], ["tissue_time", "s"], ["picture_time", "s"], ["path_length", "mm"], ["path_inefficiency", "%"], ["tissue_damage", "mm²"],
-  ["punctures", ""], ["redirections", ""], ["vessel_contacts", ""], ["smoothness", "mm/s²·⁵"],
+  ["final_error", "mm"], ["target_shift", "mm"], ["time", "s"], ["tissue_time", "s"], ["path_length", "mm"], ["path_inefficiency", "%"], ["tissue_damage", "mm²"],
+  ["punctures", ""], ["redirections", ""], ["vessel_contacts", ""], ["picture_time", "s"], ["smoothness", "mm/s²·⁵"],
 ]);
 
 /** Open a dialog that is not open. @param {string} id */

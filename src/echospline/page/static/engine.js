@@ -168,10 +168,10 @@ export class Engine {
   retrace(name, poses, rate, places) {
     const entry = this.pack.models.find((model) => model.name === name);
     if (!entry) throw new Error(`This scene has no model ${JSON.stringify(name)}.`);
-    const solver = solverOf(this.core, this.pack, entry), { dimension } = this.pack, rows = poses.length / (2 * dimension + 1), watched = new Float64Array(rows * places.length);
+    const solver = solverOf(this.core, this.pack, entry), D = this.pack.dimension, rows = poses.length / (2 * D + 1), watched = new Float64Array(rows * places.length);
     try {
       for (let row = 0; row < rows; ++row) {
-        solver.advance(poseOf(poses, row, 1 / rate, dimension));
+        solver.advance(poseOf(poses, row, 1 / rate, D));
         const moved = solver.at(places);
         for (let k = 0; k < places.length; ++k) watched[row * places.length + k] = places[k] + moved[k];
       }

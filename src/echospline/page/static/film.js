@@ -2,6 +2,7 @@
 
 import { poseOf } from "./engine.js";
 import { anglesOf } from "./state.js";
+import { heldAt } from "./training.js";
 
 /** @import { Engine } from "./engine.js" */
 /** @import { NeedleState } from "./state.js" */
@@ -9,8 +10,9 @@ import { anglesOf } from "./state.js";
 const CHECKPOINT = 240; // rows between states to go back to
 
 export class Film {
-  /** @param {Engine} engine @param {Float64Array} poses @param {Float64Array | null} beside poses of the expert @param {number} rate rows per second */
-  constructor(engine, poses, beside, rate) {
+  /** @param {Engine} engine @param {Float64Array} poses @param {Float64Array | null} beside poses of the expert @param {number} rate rows per second @param {Float64Array | null} [planes] where the probe was held */
+  constructor(engine, poses, beside, rate, planes = null) {
+    this.planes = planes;
     this.engine = engine;
     this.poses = poses;
     this.beside = beside;
@@ -46,6 +48,11 @@ export class Film {
   needle({ angle, heading }) {
     const { entry, tip } = this.engine.pose, way = Array.from(tip, (value, d) => value - entry[d]), depth = Math.hypot(...way);
     return { entry: Array.from(entry), depth, ...(depth > 0.01 ? anglesOf(way) : { angle, heading }) };
+  }
+
+  /** How the probe was held at this moment; null in the plane. */
+  held() {
+    return this.planes && heldAt(this.planes, Math.max(0, this.row - 1));
   }
 
   /** The expert's needle at this moment. */

@@ -14,7 +14,7 @@ import { Served } from "./served.js";
 import { Server } from "./server.js";
 import { anglesOf, initialState, next, tipOf } from "./state.js";
 import { Store, keepChoices, keptChoices } from "./store.js";
-import { Attempt, attemptsLeft, attemptsMade, landmarksOf, posesOf } from "./training.js";
+import { Attempt, attemptsLeft, attemptsMade, landmarksOf, planesOf, posesOf, seenOf } from "./training.js";
 import { LANGUAGES, wordsOf } from "./words.js";
 
 /** @import { Live } from "./draw_list.js" */
@@ -169,7 +169,7 @@ function stepOn(dt) {
     ++counts.steps;
     if (served && since.length < MOST_SINCE) since.push(...Array.from(pose.entry).slice(0, state.low.length), ...Array.from(pose.tip).slice(0, state.low.length), pose.speed);
     if (!attempt || !state.run) continue;
-    attempt.add(pose, watchedNow(attempt.places), engine.plane);
+    attempt.add(pose, watchedNow(attempt.places), state.held);
     if (attempt.steps >= Math.round(attempt.exercise.time_limit * state.rate)) {
       due = 0;
       finish("time");
@@ -233,7 +233,7 @@ function start() {
   if (!state.run) return;
   const trainee = inputOf("trainee").value.trim(), { exercise, examination } = state.run;
   renew();
-  attempt = new Attempt(exercise, state.rate, state.model, examination, trainee, new Date(), engine.pack.probe);
+  attempt = new Attempt(exercise, state.rate, state.model, examination, trainee, new Date(), state.probe);
   attemptNumber = 1 + attemptsMade(store.sessions, exercise.name, trainee);
   drawnState = null;
 }
@@ -272,8 +272,11 @@ function summarise(session, trace) {
 
 /** The trace of a kept attempt, by running it again. @param {Session} session @returns {Trace} */
 function retraced(session) {
-  const poses = posesOf(session), places = landmarksOf(session.exercise);
-  return { period: 1 / session.rate, poses, watched: engine.retrace(session.model, poses, session.rate, places), places: places.length / engine.pack.dimension, dimension: engine.pack.dimension };
+  const poses = posesOf(session), places = landmarksOf(session.exercise), planes = planesOf(session), { probe } = engine.pack;
+  return {
+    period: 1 / session.rate, dimension: engine.pack.dimension, poses, watched: engine.retrace(session.model, poses, session.rate, places), places: 1 + session.exercise.vessels.length,
+    seen: planes && probe ? seenOf(probe, poses, planes) : null,
+  };
 }
 
 /** Whether this scene can show a session; says why not. @param {Session} session */
@@ -304,7 +307,7 @@ function replay(session) {
   renew();
   engine.choose(session.model);
   const beside = expert && expert !== session ? posesOf(expert) : null;
-  film = new Film(engine, posesOf(session), beside, session.rate);
+  film = new Film(engine, posesOf(session), beside, session.rate, planesOf(session));
   act({ do: "replay", replay: { exercise: session.exercise, model: session.model, length: session.steps, events: session.events, expert: beside !== null } });
   panels.events(state, (step) => act({ do: "scrub", at: step }));
   byId("stage").focus({ preventScroll: true });
@@ -315,6 +318,8 @@ function playOn(dt) {
   if (!film || !state.replay) return;
   if (!state.replay.paused) act({ do: "played", rows: dt * state.rate * state.replay.speed });
   film.seek(Math.floor(state.replay.at));
+  const pose = film.held();
+  if (pose && pose.some((value, k) => value !== state.held?.[k])) act({ do: "adoptProbe", pose });
   const needle = film.needle(state.needle), shown = state.needle;
   if (needle.entry[0] !== shown.entry[0] || needle.depth !== shown.depth || needle.angle !== shown.angle) act({ do: "adopt", needle });
 }

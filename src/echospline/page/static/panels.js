@@ -172,7 +172,7 @@ export class Panels {
   events(state, go) {
     const say = wordsOf(state.language), length = state.replay?.length ?? 1;
     byId("events").replaceChildren(...(state.replay?.events ?? []).map(([step, kind]) => {
-      const known = ["entered", "left", "vessel", "target", "redirection"].includes(kind) ? say(`event-${kind}`) : kind;
+      const known = ["entered", "left", "vessel", "target", "redirection", "lost"].includes(kind) ? say(`event-${kind}`) : kind;
       const mark = element("button", { type: "button", title: `${(step / state.rate).toFixed(1)} s: ${known}`, ariaLabel: `${(step / state.rate).toFixed(1)} s: ${known}` });
       mark.dataset.kind = kind;
       mark.style.left = `${(100 * step) / length}%`;

@@ -12,8 +12,8 @@ import { PackError, asNumber, asNumbers, asRecord, asWhole } from "./checked.js"
  */
 
 export const MOST_TILT = 45; // degrees
+const SLICE_SIGMAS = 2, LEAST_SLICE = 0.5; // a tip is in the slice up to so many sigma of its thickness, and up to so many mm where it is thinner
 const LARGEST_PICTURE = 2048 * 2048;
-const SEEN_SIGMAS = 2, SEEN_LEAST = 0.5; // sigma of the slice, and mm, that a place may lie off the plane and is still in the picture, as in Python
 
 /** @param {unknown} value @returns {Probe} */
 export function readProbe(value) {
@@ -87,16 +87,6 @@ export function heldBetween([x, y, z, yaw, pitch, roll], low, high) {
   ];
 }
 
-/** Whether a place of the scene is in the picture: in reach of the beams, and no further off the plane than the slice is thick. @param {Probe} probe @param {ProbePose} pose @param {ArrayLike<number>} place mm */
-export function inPicture({ shape, columns, rows, spacing, origin, radius, opening, depth, elevation, elevation_depth, element_height }, pose, place) {
-  const [x, y, off] = lowered(planeMatrix(pose), place), half = 1e-9 + spacing[0] / 2, r = Math.hypot(x, y + radius);
-  const reached = shape === "linear"
-    ? x >= origin[0] - spacing[0] / 2 && x <= origin[0] + (columns - 0.5) * spacing[0] && y >= origin[1] - spacing[1] / 2 && y <= origin[1] + (rows - 0.5) * spacing[1]
-    : r >= radius - half && r <= radius + depth + half && Math.atan2(Math.abs(x), y + radius) <= (opening / 2) * (Math.PI / 180) + 1e-9;
-  const sigma = elevation === 0 ? 0 : Math.hypot(((Math.max(0, y) - elevation_depth) * element_height) / (2.5 * elevation_depth), elevation);
-  return reached && Math.abs(off) <= Math.max(SEEN_SIGMAS * sigma, SEEN_LEAST);
-}
-
 /** Which pixels the beams reach, 0 or 1; null where all are. @param {Probe} probe @returns {Uint8Array | undefined} */
 export function maskOf({ shape, columns, rows, spacing, origin, radius, opening, depth }) {
   if (shape === "linear") return undefined;
@@ -111,12 +101,25 @@ export function maskOf({ shape, columns, rows, spacing, origin, radius, opening,
 }
 
 /** Sigma of the slice at each row, mm. @param {Probe} probe @returns {Float32Array | undefined} undefined: infinitely thin */
-export function spreadOf({ rows, spacing, origin, elevation, elevation_depth, element_height }) {
-  if (elevation === 0) return undefined;
-  return Float32Array.from({ length: rows }, (_, row) => {
-    const y = Math.max(0, origin[1] + row * spacing[1]);
-    return Math.hypot(((y - elevation_depth) * element_height) / (2.5 * elevation_depth), elevation);
-  });
+export function spreadOf(probe) {
+  if (probe.elevation === 0) return undefined;
+  return Float32Array.from({ length: probe.rows }, (_, row) => sigmaAt(probe, probe.origin[1] + row * probe.spacing[1]));
+}
+
+/** Whether a tip is in the picture: in the slice, and where the beams reach; the definition of page/probe.py. @param {Probe} probe @param {ProbePose} pose @param {ArrayLike<number>} tip mm */
+export function tipSeen(probe, pose, tip) {
+  const [x, y, off] = lowered(planeMatrix(pose), tip), { shape, columns, rows, spacing, origin, radius, opening, depth } = probe, [dx, dy] = spacing;
+  if (x < origin[0] - dx / 2 || x > origin[0] + (columns - 0.5) * dx || y < origin[1] - dy / 2 || y > origin[1] + (rows - 0.5) * dy) return false;
+  if (shape === "curved") {
+    const r = Math.hypot(x, y + radius), half = 1e-9 + dx / 2;
+    if (r < radius - half || r > radius + depth + half || Math.atan2(Math.abs(x), y + radius) > (opening / 2) * (Math.PI / 180) + 1e-9) return false;
+  }
+  return Math.abs(off) <= Math.max(SLICE_SIGMAS * sigmaAt(probe, y), LEAST_SLICE);
+}
+
+/** Sigma of the slice at a depth, mm. @param {Probe} probe @param {number} y mm */
+function sigmaAt({ elevation, elevation_depth, element_height }, y) {
+  return elevation > 0 ? Math.hypot(((Math.max(0, y) - elevation_depth) * element_height) / (2.5 * elevation_depth), elevation) : 0;
 }
 
 /** What a core's plane is made with. @param {Probe} probe */

@@ -2,9 +2,9 @@
 
 /** @import { Exercise } from "./scene.js" */
 /**
- * A recorded insertion, one row per step: poses are [entry, tip, speed] with `dimension` coordinates each, watched the deformed centres of target and
- * vessels; in space, `seen` says at which steps the tip was in the picture.
- * @typedef {{ period: number, poses: Float64Array, watched: Float64Array, places: number, dimension: number, seen?: Uint8Array | null }} Trace
+ * A recorded insertion, one row per step: poses are [entry, tip, speed], watched the deformed centres of target and vessels, in `dimension`
+ * numbers each; in space `seen` says at which steps the tip was in the picture.
+ * @typedef {{ period: number, dimension: number, poses: Float64Array, watched: Float64Array, places: number, seen: Uint8Array | null }} Trace
  */
 /**
  * Result of an exercise; lengths mm, times s; null stands for infinite.
@@ -19,29 +19,37 @@ const TURN = 3, TURN_REST = 0.5; // degrees that make a redirection; s of a stea
 const STEADY = 0.01; // degrees between rows of a steady direction
 const JERK_INTERVAL = 0.05; // s over which positions are averaged before the third difference
 
-/** Numbers of a pose. @param {number} dimension */
-export function rowSize(dimension) {
+/** Numbers of a row of poses. @param {{ dimension: number }} trace */
+export function rowOf({ dimension }) {
   return 2 * dimension + 1;
 }
 
 /** Number of rows. @param {Trace} trace */
-export function rowsOf({ poses, dimension }) {
-  return poses.length / rowSize(dimension);
+export function rowsOf(trace) {
+  return trace.poses.length / rowOf(trace);
 }
 
-/** Entry of a row. @param {Trace} trace @param {number} row */
-function entryAt({ poses, dimension }, row) {
-  return poses.subarray(row * rowSize(dimension), row * rowSize(dimension) + dimension);
+/** @param {Trace} trace @param {number} row @returns {Float64Array} mm */
+export function entryAt({ poses, dimension }, row) {
+  const k = (2 * dimension + 1) * row;
+  return poses.subarray(k, k + dimension);
 }
 
-/** Tip of a row. @param {Trace} trace @param {number} row */
+/** @param {Trace} trace @param {number} row @returns {Float64Array} mm */
 export function tipAt({ poses, dimension }, row) {
-  return poses.subarray(row * rowSize(dimension) + dimension, row * rowSize(dimension) + 2 * dimension);
+  const k = (2 * dimension + 1) * row + dimension;
+  return poses.subarray(k, k + dimension);
 }
 
-/** From a place to another, mm. @param {ArrayLike<number>} a @param {ArrayLike<number>} b */
-function away(a, b) {
-  return Math.hypot(...Array.from(a, (value, d) => b[d] - value));
+/** Deformed centre of a place. @param {Trace} trace @param {number} row @param {number} place @returns {Float64Array} mm */
+export function watchedAt({ watched, places, dimension }, row, place) {
+  const k = dimension * (row * places + place);
+  return watched.subarray(k, k + dimension);
+}
+
+/** @param {ArrayLike<number>} a @param {ArrayLike<number>} b */
+export function apart(a, b) {
+  return a.length === 2 ? Math.hypot(a[0] - b[0], a[1] - b[1]) : Math.hypot(Math.hypot(a[0] - b[0], a[1] - b[1]), a[2] - b[2]);
 }
 
 /** Score a trace: a pure function, so that a stored session can be scored again. @param {Trace} trace @param {Exercise} exercise @returns {Score} */
@@ -55,47 +63,47 @@ export function scoreOf(trace, exercise) {
   let path = 0, damage = 0;
   for (let row = 1; row < n; ++row) {
     if (!inside[row] || !inside[row - 1]) continue;
-    path += away(tipAt(trace, row - 1), tipAt(trace, row));
+    path += apart(tipAt(trace, row), tipAt(trace, row - 1));
     damage += sweptArea(trace, row);
   }
   const touched = exercise.vessels.reduce((sum, vessel, j) => sum + rises(contactsOf(trace, 1 + j, vessel.radius, inside)), 0);
-  const last = n - 1, end = watchedAt(trace, last, 0), error = inside[last] ? away(tipAt(trace, last), end) : Infinity;
+  const last = n - 1, target = watchedAt(trace, last, 0);
+  const error = inside[last] ? apart(tipAt(trace, last), target) : Infinity;
   const turned = redirectionsOf(trace, inside).length, most = exercise.most_redirections ?? Infinity;
   const inefficiency = inefficiencyOf(trace, inside, path);
   return {
     passed: error <= exercise.target.radius && touched === 0 && turned <= most, time: period * n, tissue_time: period * inside.reduce((a, b) => a + b, 0),
     path_length: path, path_inefficiency: Number.isFinite(inefficiency) ? inefficiency : null, tissue_damage: damage, punctures: rises(inside), redirections: turned,
-    smoothness: smoothnessOf(trace), final_error: Number.isFinite(error) ? error : null, target_shift: away(exercise.target.centre, end), vessel_contacts: touched,
+    smoothness: smoothnessOf(trace), final_error: Number.isFinite(error) ? error : null, target_shift: apart(target, exercise.target.centre), vessel_contacts: touched,
     ...(seen ? { picture_time: period * inside.reduce((sum, on, row) => sum + Number(on && seen[row]), 0) } : {}),
   };
 }
 
 /** Which rows have the needle in the tissue. @param {Trace} trace @returns {Uint8Array} */
 export function insideOf(trace) {
-  return Uint8Array.from({ length: rowsOf(trace) }, (_, row) => Number(away(entryAt(trace, row), tipAt(trace, row)) > INSIDE));
-}
-
-/** Deformed centre of a place. @param {Trace} trace @param {number} row @param {number} place */
-export function watchedAt({ watched, places, dimension }, row, place) {
-  const k = dimension * (row * places + place);
-  return watched.subarray(k, k + dimension);
+  return Uint8Array.from({ length: rowsOf(trace) }, (_, row) => Number(apart(tipAt(trace, row), entryAt(trace, row)) > INSIDE));
 }
 
 /** Area between the shaft of a row and that of the row before, mm^2. @param {Trace} trace @param {number} row */
 function sweptArea(trace, row) {
-  const a = entryAt(trace, row - 1), b = tipAt(trace, row - 1), c = tipAt(trace, row), d = entryAt(trace, row);
+  const [a, b, c, d] = [entryAt(trace, row - 1), tipAt(trace, row - 1), tipAt(trace, row), entryAt(trace, row)];
   return triangleArea(a, b, c) + triangleArea(a, c, d);
 }
 
 /** @param {ArrayLike<number>} a @param {ArrayLike<number>} b @param {ArrayLike<number>} c */
 function triangleArea(a, b, c) {
-  return 0.5 * crossSize(Array.from(a, (value, d) => b[d] - value), Array.from(a, (value, d) => c[d] - value));
+  return 0.5 * crossed(minus(b, a), minus(c, a));
 }
 
-/** Size of the cross product. @param {ArrayLike<number>} u @param {ArrayLike<number>} v */
-function crossSize(u, v) {
+/** @param {ArrayLike<number>} a @param {ArrayLike<number>} b @returns {number[]} */
+function minus(a, b) {
+  return Array.from(a, (value, d) => value - b[d]);
+}
+
+/** Length of the cross product. @param {number[]} u @param {number[]} v */
+function crossed(u, v) {
   const z = u[0] * v[1] - u[1] * v[0];
-  return u.length === 2 ? Math.abs(z) : Math.hypot(u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], z);
+  return u.length === 2 ? Math.abs(z) : Math.hypot(Math.hypot(u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2]), z);
 }
 
 /** Rows at which a turn inside the tissue exceeds TURN; one turn lasts until the needle holds still. @param {Trace} trace @param {Uint8Array} inside @returns {number[]} */
@@ -122,20 +130,18 @@ export function redirectionsOf(trace, inside) {
   return found;
 }
 
-/** Degrees between the directions of two rows: in the plane all the way round, in space the angle. @param {Trace} trace @returns {(row: number, other: number) => number} */
+/** Degrees between the directions of two rows. @param {Trace} trace @returns {(row: number, other: number) => number} */
 function turnsOf(trace) {
-  const along = (/** @type {number} */ row) => {
-    const entry = entryAt(trace, row);
-    return Array.from(tipAt(trace, row), (value, d) => value - entry[d]);
-  };
+  const along = (/** @type {number} */ row) => minus(tipAt(trace, row), entryAt(trace, row));
   if (trace.dimension === 3) {
     return (row, other) => {
-      const u = along(row), v = along(other);
-      return (Math.atan2(crossSize(u, v), u[0] * v[0] + u[1] * v[1] + u[2] * v[2]) * 180) / Math.PI;
+      const [a, b] = [along(row), along(other)];
+      return (Math.atan2(crossed(a, b), a[0] * b[0] + a[1] * b[1] + a[2] * b[2]) * 180) / Math.PI;
     };
   }
   const degrees = new Float64Array(rowsOf(trace));
-  for (let row = 0, whole = 0, before = 0; row < degrees.length; ++row) {
+  let before = 0, whole = 0;
+  for (let row = 0; row < degrees.length; ++row) {
     const [x, y] = along(row), raw = Math.atan2(y, x);
     if (row) whole += unwrapping(raw - before);
     degrees[row] = ((raw + whole) * 180) / Math.PI;
@@ -144,27 +150,26 @@ function turnsOf(trace) {
   return (row, other) => Math.abs(degrees[row] - degrees[other]);
 }
 
-/** Which rows have the shaft in a round structure that moves with the tissue. @param {Trace} trace @param {number} place @param {number} radius @param {Uint8Array} inside @returns {Uint8Array} */
+/** Which rows have the shaft in a round structure that moves with the tissue. @param {Trace} trace @param {number} place @param {number} radius mm @param {Uint8Array} inside @returns {Uint8Array} */
 export function contactsOf(trace, place, radius, inside) {
-  return inside.map((within, row) => {
-    if (!within) return 0;
-    const entry = entryAt(trace, row), centre = watchedAt(trace, row, place), along = Array.from(tipAt(trace, row), (value, d) => value - entry[d]);
-    const dot = along.reduce((sum, value, d) => sum + (centre[d] - entry[d]) * value, 0), size = along.reduce((sum, value) => sum + value * value, 0);
-    const t = Math.min(1, Math.max(0, dot / Math.max(size, 1e-12)));
-    return Number(away(along.map((value, d) => entry[d] + t * value), centre) <= radius);
+  return inside.map((on, row) => {
+    if (!on) return 0;
+    const entry = entryAt(trace, row), along = minus(tipAt(trace, row), entry), from = minus(watchedAt(trace, row, place), entry);
+    const [dot, square] = along.reduce(([a, b], value, d) => [a + from[d] * value, b + value * value], [0, 0]);
+    const t = Math.min(1, Math.max(0, dot / Math.max(square, 1e-12)));
+    return Number(apart(along.map((value) => t * value), from) <= radius);
   });
 }
 
 /** Root of the integral of the squared jerk of the tip, mm/s^2.5. @param {Trace} trace */
 function smoothnessOf(trace) {
-  const { poses, period, dimension } = trace, size = rowSize(dimension);
-  const rows = Math.max(1, roundHalfEven(JERK_INTERVAL / period)), blocks = Math.floor(rowsOf(trace) / rows), dt = rows * period;
+  const { period, dimension } = trace, rows = Math.max(1, roundHalfEven(JERK_INTERVAL / period)), blocks = Math.floor(rowsOf(trace) / rows), dt = rows * period;
   if (blocks < 4) return 0;
   let sum = 0;
-  for (let axis = dimension; axis < 2 * dimension; ++axis) {
+  for (let axis = 0; axis < dimension; ++axis) {
     const mean = Float64Array.from({ length: blocks }, (_, b) => {
       let total = 0;
-      for (let row = 0; row < rows; ++row) total += poses[size * (b * rows + row) + axis];
+      for (let row = 0; row < rows; ++row) total += tipAt(trace, b * rows + row)[axis];
       return total / rows;
     });
     for (let b = 3; b < blocks; ++b) sum += ((mean[b] - mean[b - 1] - 2 * (mean[b - 1] - mean[b - 2]) + (mean[b - 2] - mean[b - 3])) / dt ** 3) ** 2;
@@ -176,7 +181,7 @@ function smoothnessOf(trace) {
 function inefficiencyOf(trace, inside, path) {
   const first = inside.indexOf(1), last = inside.lastIndexOf(1);
   if (first < 0) return 0;
-  const straight = away(tipAt(trace, first), tipAt(trace, last));
+  const straight = apart(tipAt(trace, last), tipAt(trace, first));
   return straight > INSIDE ? 100 * (path / straight - 1) : Infinity;
 }
 

@@ -2,9 +2,9 @@
 
 import { decoded, inBase64 } from "./bytes.js";
 import { PackError, asList, asNumber, asRecord, asText, asWhole } from "./checked.js";
-import { inPicture } from "./probe.js";
 import { readExercise } from "./scene.js";
-import { contactsOf, insideOf, redirectionsOf, rowSize, rowsOf, scoreOf, tipAt, watchedAt } from "./scoring.js";
+import { tipSeen } from "./probe.js";
+import { apart, contactsOf, entryAt, insideOf, redirectionsOf, rowsOf, scoreOf, tipAt, watchedAt } from "./scoring.js";
 
 /** @import { Probe, ProbePose } from "./probe.js" */
 /** @import { Exercise } from "./scene.js" */
@@ -20,14 +20,15 @@ import { contactsOf, insideOf, redirectionsOf, rowSize, rowsOf, scoreOf, tipAt, 
  */
 /** What made a session. @typedef {{ version: string, core: string, title: string, pack: string }} Origin */
 
-const PLANE = 7; // numbers of a row of planes: step, x, y, z, yaw, pitch, roll
-const IN_BASE64 = /^[A-Za-z0-9+/]*={0,2}$/;
 const MOST_SESSIONS = 5000, MOST_STEPS = 2_000_000, MOST_EVENTS = 10_000;
 const SHARE = "echospline session", SEVERAL = "echospline sessions";
 
 /** Collects an attempt; a row is a step. */
 export class Attempt {
-  /** @param {Exercise} exercise @param {number} rate steps per second @param {string} model @param {boolean} examination @param {string} trainee @param {Date} started @param {Probe | null} [probe] of a scene in space */
+  /**
+   * @param {Exercise} exercise @param {number} rate steps per second @param {string} model @param {boolean} examination @param {string} trainee @param {Date} started
+   * @param {Probe | null} [probe] of a scene in space
+   */
   constructor(exercise, rate, model, examination, trainee, started, probe = null) {
     this.exercise = exercise;
     this.rate = rate;
@@ -35,17 +36,18 @@ export class Attempt {
     this.examination = examination;
     this.trainee = trainee;
     this.started = started;
+    this.probe = probe;
+    this.dimension = exercise.target.centre.length;
     /** @type {number[]} */
     this.poses = [];
     /** @type {number[]} */
     this.watched = [];
-    this.probe = probe;
-    /** Rows of [step, pose] at which the probe was moved. @type {number[]} */
+    /** Rows of step and pose: from that step on the probe was held so. @type {number[]} */
     this.planes = [];
-    /** @type {ProbePose | null} */
-    this.held = null;
     /** @type {number[]} */
     this.seen = [];
+    /** @type {ProbePose | null} */
+    this.held = null;
     this.steps = 0;
   }
 
@@ -54,24 +56,25 @@ export class Attempt {
     return landmarksOf(this.exercise);
   }
 
-  /** @param {{ entry: ArrayLike<number>, tip: ArrayLike<number>, speed: number }} pose @param {ArrayLike<number>} watched @param {ProbePose | null} [held] where the probe is */
+  /** @param {{ entry: ArrayLike<number>, tip: ArrayLike<number>, speed: number }} pose @param {ArrayLike<number>} watched @param {ProbePose | null} [held] how the probe is held */
   add({ entry, tip, speed }, watched, held = null) {
-    for (const place of [entry, tip]) for (let d = 0; d < this.exercise.target.centre.length; ++d) this.poses.push(place[d]);
+    for (let d = 0; d < this.dimension; ++d) this.poses.push(entry[d]);
+    for (let d = 0; d < this.dimension; ++d) this.poses.push(tip[d]);
     this.poses.push(speed);
-    if (this.probe && held) {
-      if (held.some((value, k) => value !== this.held?.[k])) this.planes.push(this.steps, ...held);
-      this.held = held;
-      this.seen.push(Number(inPicture(this.probe, held, tip)));
-    }
     for (let k = 0; k < watched.length; ++k) this.watched.push(watched[k]);
+    if (this.probe && held) {
+      if (held !== this.held) this.planes.push(this.steps, ...held);
+      this.held = held;
+      this.seen.push(Number(tipSeen(this.probe, held, tip)));
+    }
     ++this.steps;
   }
 
   /** @returns {Trace} */
   get trace() {
     return {
-      period: 1 / this.rate, poses: Float64Array.from(this.poses), watched: Float64Array.from(this.watched), places: 1 + this.exercise.vessels.length,
-      dimension: this.exercise.target.centre.length, seen: this.probe ? Uint8Array.from(this.seen) : null,
+      period: 1 / this.rate, dimension: this.dimension, poses: Float64Array.from(this.poses), watched: Float64Array.from(this.watched), places: 1 + this.exercise.vessels.length,
+      seen: this.probe ? Uint8Array.from(this.seen) : null,
     };
   }
 
@@ -81,7 +84,7 @@ export class Attempt {
     return {
       format: 1, kind: SHARE, version: origin.version, core: origin.core, scene: { title: origin.title, pack: origin.pack }, model: this.model,
       exercise: this.exercise, examination: this.examination, trainee: this.trainee, attempt, started: this.started.toISOString(), rate: this.rate, ended,
-      steps: this.steps, poses: inBase64(trace.poses), planes: this.planes.length ? inBase64(Float64Array.from(this.planes)) : null, events: eventsOf(trace, this.exercise), score: scoreOf(trace, this.exercise),
+      steps: this.steps, poses: inBase64(trace.poses), planes: this.probe ? inBase64(Float64Array.from(this.planes)) : null, events: eventsOf(trace, this.exercise), score: scoreOf(trace, this.exercise),
     };
   }
 }
@@ -107,28 +110,45 @@ export function eventsOf(trace, exercise) {
   exercise.vessels.forEach((vessel, j) => edges(contactsOf(trace, 1 + j, vessel.radius, inside), "vessel"));
   edges(inside.map((on, row) => Number(on && distanceAt(trace, row) <= exercise.target.radius)), "target");
   for (const row of redirectionsOf(trace, inside)) events.push([row, "redirection"]);
+  if (trace.seen) edges(inside.map((on, row) => Number(on && !trace.seen?.[row])), "lost");
   return events.sort((a, b) => a[0] - b[0]);
 }
 
 /** Tip to the deformed target's centre, mm. @param {Trace} trace @param {number} row */
 export function distanceAt(trace, row) {
-  const centre = watchedAt(trace, row, 0);
-  return Math.hypot(...Array.from(tipAt(trace, row), (value, d) => value - centre[d]));
+  return apart(tipAt(trace, row), watchedAt(trace, row, 0));
 }
 
 /** Depth and distance to the target over time, thinned for a plot. @param {Trace} trace @param {number} [most] points */
 export function plotOf(trace, most = 400) {
   const n = rowsOf(trace), stride = Math.max(1, Math.ceil(n / most));
-  const rows = Array.from({ length: Math.ceil(n / stride) }, (_, k) => k * stride), { poses: p, dimension: D } = trace, size = rowSize(D);
+  const rows = Array.from({ length: Math.ceil(n / stride) }, (_, k) => k * stride);
   return {
     time: rows.map((row) => row * trace.period), distance: rows.map((row) => distanceAt(trace, row)),
-    depth: rows.map((row) => Math.hypot(...Array.from({ length: D }, (_, d) => p[size * row + D + d] - p[size * row + d]))),
+    depth: rows.map((row) => apart(tipAt(trace, row), entryAt(trace, row))),
   };
 }
 
-/** Poses of a session, row by row. @param {Session} session @returns {Float64Array} */
+/** Poses of a session, rows of [entry, tip, speed]. @param {Session} session @returns {Float64Array} */
 export function posesOf(session) {
   return fromBase64(session.poses);
+}
+
+/** Where the probe of a session was held, rows of [step, pose]; null in the plane. @param {Session} session @returns {Float64Array | null} */
+export function planesOf(session) {
+  return session.planes === null ? null : fromBase64(session.planes);
+}
+
+/** How the probe was held at a row. @param {Float64Array} planes @param {number} row @returns {ProbePose} */
+export function heldAt(planes, row) {
+  let k = 0;
+  while (7 * (k + 1) < planes.length && planes[7 * (k + 1)] <= row) ++k;
+  return /** @type {ProbePose} */ (/** @type {unknown} */ (Array.from(planes.subarray(7 * k + 1, 7 * k + 7))));
+}
+
+/** Which rows of poses had the tip in the picture. @param {Probe} probe @param {Float64Array} poses in space @param {Float64Array} planes */
+export function seenOf(probe, poses, planes) {
+  return Uint8Array.from({ length: poses.length / 7 }, (_, row) => Number(tipSeen(probe, heldAt(planes, row), poses.subarray(7 * row + 3, 7 * row + 6))));
 }
 
 /** Sessions of a file: one, or several. @param {string} json @returns {Session[]} */
@@ -152,20 +172,20 @@ export function readSession(value, what) {
   const s = asRecord(value, what);
   if (s.format !== 1 || s.kind !== SHARE) throw new PackError(`${what} is no session of format 1; export it again.`);
   const steps = asWhole(s.steps, `${what}.steps`, 0, MOST_STEPS), scene = asRecord(s.scene, `${what}.scene`);
-  const centre = asRecord(asRecord(s.exercise, `${what}.exercise`).target, `${what}.exercise.target`).centre, dimension = Array.isArray(centre) && centre.length === 3 ? 3 : 2;
-  const poses = asText(s.poses, `${what}.poses`, 16 * MOST_STEPS * rowSize(dimension)), planes = s.planes === null || s.planes === undefined ? null : asText(s.planes, `${what}.planes`, 16 * MOST_STEPS * PLANE);
-  if (planes !== null && (!IN_BASE64.test(planes) || decoded(planes).length % (8 * PLANE))) throw new PackError(`${what}.planes are no rows of ${PLANE} numbers: the file is cut or changed.`);
-  if (!IN_BASE64.test(poses) || poses.length !== 4 * Math.ceil((8 * rowSize(dimension) * steps) / 3)) {
+  const space = Array.isArray(s.exercise?.target?.centre) && s.exercise.target.centre.length === 3, columns = space ? 7 : 5;
+  const poses = asText(s.poses, `${what}.poses`, 8 * MOST_STEPS * columns * 2), planes = s.planes === null || s.planes === undefined ? null : asText(s.planes, `${what}.planes`, 8 * MOST_STEPS * 7 * 2);
+  if (!/^[A-Za-z0-9+/]*={0,2}$/.test(poses) || poses.length !== 4 * Math.ceil((8 * columns * steps) / 3)) {
     throw new PackError(`${what} says ${steps} steps, but its poses are of another length: the file is cut or changed.`);
   }
   if (!fromBase64(poses).every(Number.isFinite)) throw new PackError(`${what} holds poses that are no finite numbers.`);
+  if ((planes !== null) !== space || (planes !== null && !arePlanes(planes))) throw new PackError(`${what} says wrongly where its probe was: the file is cut or changed.`);
   if (!["finished", "reset", "time"].includes(s.ended)) throw new PackError(`${what}.ended is finished, reset or time.`);
   const started = asText(s.started, `${what}.started`, 40);
   if (Number.isNaN(Date.parse(started))) throw new PackError(`${what}.started is no time.`);
   return {
     format: 1, kind: SHARE, version: asText(s.version, `${what}.version`, 80), core: asText(s.core, `${what}.core`, 200),
     scene: { title: asText(scene.title, `${what}.scene.title`, 200), pack: asText(scene.pack, `${what}.scene.pack`, 200) }, model: asText(s.model, `${what}.model`, 40),
-    exercise: readExercise(s.exercise, `${what}.exercise`, dimension), examination: s.examination === true, trainee: asText(s.trainee, `${what}.trainee`, 80),
+    exercise: readExercise(s.exercise, `${what}.exercise`, space ? 3 : 2), examination: s.examination === true, trainee: asText(s.trainee, `${what}.trainee`, 80),
     attempt: asWhole(s.attempt, `${what}.attempt`, 0, 1e6), started, rate: asNumber(s.rate, `${what}.rate`, 10, 2000), ended: s.ended, steps, poses, planes,
     events: asList(s.events, `${what}.events`, 0, MOST_EVENTS).map((e) => {
       const pair = asList(e, `${what}.events`, 2, 2);
@@ -173,6 +193,15 @@ export function readSession(value, what) {
     }),
     score: s.score === null ? null : readScore(s.score, `${what}.score`),
   };
+}
+
+/** Whether rows of [step, pose] begin at step 0 and ascend. @param {string} text */
+function arePlanes(text) {
+  if (!/^[A-Za-z0-9+/]*={0,2}$/.test(text) || text.length % 4) return false;
+  const bytes = decoded(text);
+  if (bytes.length % 56) return false;
+  const rows = new Float64Array(bytes.buffer);
+  return rows.every(Number.isFinite) && rows.every((value, k) => k % 7 !== 0 || (k ? value > rows[k - 7] && Number.isInteger(value) : value === 0));
 }
 
 /** @param {unknown} value @param {string} what @returns {Score} */

@@ -70,7 +70,7 @@ const TABLE = {
   "why-hit": ["the tip ended {error} mm from the target's centre", "die Spitze endete {error} mm von der Mitte des Ziels"],
   "why-vessel": ["a vessel was touched {count} times", "ein Gefäß wurde {count}-mal berührt"],
   "why-turns": ["{count} redirections, {most} allowed", "{count} Richtungswechsel, {most} erlaubt"],
-  "final_error": ["Tip to target", "Spitze zum Ziel"], "target_shift": ["Target moved by the tissue", "Ziel vom Gewebe bewegt"], "time": ["Time", "Zeit"], "tissue_time": ["Time in tissue", "Zeit im Gewebe"], "picture_time": ["Tip in the picture", "Spitze im Bild"], "path_length": ["Path length", "Weglänge"],
+  "final_error": ["Tip to target", "Spitze zum Ziel"], "target_shift": ["Target moved by the tissue", "Ziel vom Gewebe bewegt"], "time": ["Time", "Zeit"], "picture_time": ["Tip in the picture", "Spitze im Bild"], "tissue_time": ["Time in tissue", "Zeit im Gewebe"], "path_length": ["Path length", "Weglänge"],
   "path_inefficiency": ["Path inefficiency", "Umweg"], "tissue_damage": ["Tissue damage (area swept)", "Gewebeschaden (überstrichene Fläche)"], "punctures": ["Punctures", "Einstiche"],
   "redirections": ["Redirections", "Richtungswechsel"], "vessel_contacts": ["Vessel contacts", "Gefäßberührungen"], "smoothness": ["Smoothness (less is smoother)", "Ruck (weniger ist ruhiger)"],
   "plot-distance": ["tip to target", "Spitze zum Ziel"], "plot-depth": ["depth", "Tiefe"], "plot-time": ["time, s", "Zeit, s"], "plot-radius": ["target radius", "Zielradius"], "plot-attempt": ["attempt", "Versuch"], "plot-expert": ["expert", "Experte"],
@@ -89,7 +89,7 @@ const TABLE = {
   "class-csv": ["Sessions as CSV", "Versuche als CSV"], "class-curves-csv": ["Curves as CSV", "Kurven als CSV"], "class-again": ["Read anew", "Neu lesen"],
   // replay
   "play": ["Play", "Abspielen"], "pause": ["Pause", "Anhalten"], "speed": ["Speed", "Tempo"], "scrub": ["Place in the replay", "Stelle der Wiedergabe"], "leave": ["End replay", "Wiedergabe beenden"],
-  "event-entered": ["needle in", "Nadel ein"], "event-left": ["needle out", "Nadel aus"], "event-vessel": ["vessel touched", "Gefäß berührt"], "event-target": ["target reached", "Ziel erreicht"], "event-redirection": ["redirection", "Richtungswechsel"],
+  "event-entered": ["needle in", "Nadel ein"], "event-left": ["needle out", "Nadel aus"], "event-vessel": ["vessel touched", "Gefäß berührt"], "event-target": ["target reached", "Ziel erreicht"], "event-lost": ["tip lost from the picture", "Spitze aus dem Bild"], "event-redirection": ["redirection", "Richtungswechsel"],
   // help and notes
   "help-title": ["How to steer", "So steuerst du"],
   "help-text": ["Press near the skin to choose the entry, or inside the picture to aim. Drag to push and pull along the needle; with Shift or the right button, or with two fingers, turn it about its entry. The wheel pushes too. How fast you push matters, and under a needle at rest the tissue relaxes.", "Nahe der Haut drücken, um den Einstich zu wählen, oder im Bild, um zu zielen. Ziehen schiebt und zieht entlang der Nadel; mit Umschalt oder der rechten Taste oder zwei Fingern dreht sie um den Einstich. Auch das Rad schiebt. Das Tempo zählt, und unter einer ruhenden Nadel entspannt sich das Gewebe."],
