@@ -207,7 +207,7 @@ def test_the_shipped_spine_is_packed(tmp_path):
 
     scenario = Scenario().with_values({"image.file": "sample:spine"}, "test")
     whole = packed_space(open_spatial(scenario, Path()))
-    assert [model.name for model in whole.manifest.models][0] == "green"
+    assert whole.manifest.models[0].name == "green"
     assert run(whole) == ""
 
 
