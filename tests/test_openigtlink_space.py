@@ -679,3 +679,27 @@ def test_the_shipped_device_set_moves_probe_and_needle_from_another_librarys_ser
         process.terminate()
         process.wait(20)
         server.stop()
+
+
+def test_pages_follow_probe_and_needle_of_a_tracker_in_a_volume(tmp_path):
+    """`echospline live VOLUME --link`: what the tracker does to both is told to every page."""
+    from echospline.viewer import steer, turn  # noqa: PLC0415
+    from live_scene import listening, running, waited  # noqa: PLC0415
+
+    with running(tmp_path) as (address, _, served), listening(address) as page:
+        waited(served, 1)
+        with Session(
+            make_stage(),
+            QUICK,
+            moved=lambda pose, new: steer(served, pose, new),
+            placed=lambda plane: turn(served, plane.matrix.ravel()),
+        ) as session:
+            console = Console(session.port)
+            console.send(probe_message(PLANE))
+            told = np.array(page.hear("plane")["plane"]).reshape(4, 4)
+            np.testing.assert_allclose(told, PLANE.matrix, atol=1e-5)
+            console.send(needle_message(DEEP))
+            needle = page.hear("tip")
+            np.testing.assert_allclose([needle["entry"], needle["tip"]], [DEEP.entry, DEEP.tip], atol=1e-4)
+            assert needle["appears"]
+            console.close()
