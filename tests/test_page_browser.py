@@ -15,7 +15,7 @@ from PIL import Image
 from playwright.sync_api import expect
 
 import page_scene
-from echospline.page import bundle, packed_space, read_sessions, verify
+from echospline.page import bundle, pack_of_page, packed_space, read_sessions, verify
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 WASM = page_scene.ROOT / "src" / "echospline" / "_native" / "echospline.wasm"
@@ -635,7 +635,7 @@ def test_the_small_drawing_takes_the_probe_and_can_be_hidden(opened, volume_file
     assert moved[0] > before[0] + 1
     assert moved[2] > before[2] + 1
     assert depth(page) == 0, "and not the needle"
-    page.locator('[data-help="body"]').uncheck(force=True)
+    page.keyboard.press("k")
     page.wait_for_timeout(200)
     corner = picture(page)[-200:, -250:]
     assert np.abs(corner - shown[-200:, -250:]).mean() > 3
@@ -653,3 +653,41 @@ def test_the_guide_says_where_a_needle_across_would_pass_and_the_numbers_how_far
     page.wait_for_timeout(300)
     assert plane(page)[0] > 0
     assert page.locator("#fault").is_hidden()
+
+
+def test_an_attempt_with_both_hands_is_scored_replayed_and_verified_by_the_package(
+    opened, volume_file, tmp_path
+):
+    page = ready(opened(path=volume_file))
+    page.keyboard.press("e")
+    until(page, "document.body.classList.contains('recording')")
+    page.keyboard.down("ArrowDown")
+    until(page, "Number(document.getElementById('stage').dataset.depth) > 3")
+    page.keyboard.down("KeyW")  # the probe slides off the needle
+    until(page, "Number(document.getElementById('stage').dataset.depth) > 9")
+    page.keyboard.up("KeyW")
+    page.keyboard.up("ArrowDown")
+    page.keyboard.press("x")
+    page.wait_for_timeout(400)
+    page.keyboard.press("e")
+    expect(page.locator("#summary")).to_be_visible()
+    assert "Tip in the picture" in page.locator("#metrics").text_content()
+    with page.expect_download() as made:
+        page.locator("#export-one").click()
+    made.value.save_as(tmp_path / "one.json")
+    [session] = read_sessions(tmp_path / "one.json")
+    assert session.planes
+    checked = verify(pack_of_page(volume_file), session)
+    assert checked.differences == ()
+    assert 0 < checked.score.picture_time < checked.score.tissue_time
+    assert "lost" in {kind for _, kind in session.events}
+    end = plane(page)
+    page.locator("#watch").click()
+    expect(page.locator("#player")).to_be_visible()
+    page.locator("#scrub").focus()
+    page.keyboard.press("Home")
+    page.wait_for_timeout(300)
+    page.keyboard.press("End")
+    until(page, "Number(document.getElementById('stage').dataset.depth) > 8.5")
+    page.wait_for_timeout(300)
+    np.testing.assert_allclose(plane(page), end, atol=0.02)
