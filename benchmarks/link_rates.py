@@ -25,6 +25,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from echospline.cli.link import make_stage
+from echospline.cli.link_space import make_spatial_stage
 from echospline.openigtlink import Link, Looks, Message, Rates, Session, SessionOptions, Transform
 from echospline.openigtlink.crc64 import crc64
 from echospline.openigtlink.decoder import Decoder
@@ -34,7 +35,7 @@ from echospline.openigtlink.outgoing import draw
 from echospline.openigtlink.peer import Peer
 from echospline.picture import Drawing
 from echospline.scenario import Scenario
-from echospline.scene import Visible
+from echospline.scene import AXIAL, Visible, probe_plane
 
 SIDE, WARM_UP = 512, 0.5
 PICTURE = np.random.default_rng(1).integers(0, 256, (1, SIDE, SIDE), dtype=np.uint8)
@@ -46,8 +47,15 @@ def needle(now: float) -> np.ndarray:
     return np.array([[1, 0, 0, -25.0], [0, 0, -1, -depth], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 
-def listen(port: int, seconds: float, pause: float, transforms: float, pipe: Connection) -> None:
-    """Peer process: read images (sleeping ``pause`` after each), send transforms; report ages and counts."""
+def probe(now: float) -> np.ndarray:
+    """Frame of a probe that sweeps and turns over the middle of a volume in its default place."""
+    return AXIAL @ probe_plane((3 * np.sin(now), 0.0, 2 * np.cos(now)), 10 * np.sin(now)).matrix
+
+
+def listen(
+    port: int, seconds: float, pause: float, transforms: float, pipe: Connection, space: bool = False
+) -> None:
+    """Peer process: read images (sleeping ``pause`` after each), send transforms (in space the probe's too); report ages and counts."""
     sys.setswitchinterval(0.0005)  # the peer's two threads shall not wait 5 ms for each other
     connection = socket.create_connection(("127.0.0.1", port))
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -61,6 +69,10 @@ def listen(port: int, seconds: float, pause: float, transforms: float, pipe: Con
             connection.sendall(
                 encode(Message(Transform(needle(time.time())), "NeedleTipToReference", time.time()))
             )
+            if space:
+                connection.sendall(
+                    encode(Message(Transform(probe(time.time())), "ProbeToReference", time.time()))
+                )
             sent += 1
             due += 1 / transforms
             time.sleep(max(0.0, due - time.monotonic()))
@@ -194,6 +206,26 @@ def whole(seconds: float) -> None:
     )
 
 
+def in_volume(seconds: float, source: str) -> None:
+    """Run the whole session in space: a tracked probe that sweeps and a tracked needle, 25 pictures per second."""
+    stage = make_spatial_stage(Scenario().with_values({"image.file": source}), Path())
+    with threadpool_limits(limits=1), Session(stage, SessionOptions(port=0, rates=Rates(25.0))) as session:
+        ours, theirs = multiprocessing.Pipe()
+        process = multiprocessing.Process(
+            target=listen, args=(session.port, seconds + WARM_UP, 0.0, 250.0, theirs, True)
+        )
+        began, cpu = time.monotonic(), time.process_time()
+        process.start()
+        ages, _, _ = ours.recv()
+        cores = (time.process_time() - cpu) / (time.monotonic() - began)
+        process.join()
+        newest = stage.engine.snapshots.latest().value
+    print(
+        f"\nwhole session in {source}, {newest.drawn.image.pixels.shape} pixels, {stage.engine.model.grid.size} nodes, 25 pictures and 250 places "
+        f"of probe and needle per second:\n  {len(ages) / seconds:.1f} images/s, {cores:.2f} cores"
+    )
+
+
 def milliseconds(ages: list[float]) -> str:
     if not ages:
         return "none"
@@ -240,7 +272,13 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=5.0)
     parser.add_argument("--rate", type=float, default=60.0)
     parser.add_argument("--out", type=Path)
+    parser.add_argument(
+        "--volume", help="measure the session in this volume alone: sample:kidney, sample:spine"
+    )
     options = parser.parse_args()
+    if options.volume:
+        in_volume(options.seconds, options.volume)
+        return
     report: dict[str, Any] = {"codec_ms": codec(), "rows": []}
     print("codec, median ms")
     for name, ms in report["codec_ms"].items():

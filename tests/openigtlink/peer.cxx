@@ -7,6 +7,7 @@
 //   peer serve PORT FILE...         waits for one client, sends it the files' bytes, prints what it sends
 //   peer follow HOST PORT KIND N    sends STT_TDATA or STT_QTDATA (20 ms), prints N answers, sends STP_, prints what follows
 //                                   up to the answer to STP_
+//   peer move HOST PORT COUNT NAME N...  sends TRANSFORM NAME with 12 numbers, row by row, then prints COUNT messages
 //
 // g++ peer.cxx -I/usr/include/openigtlink -lOpenIGTLink -lpthread -o peer
 
@@ -395,6 +396,16 @@ int main(int argc, char **argv) {
     stop->Pack();
     socket->Send(stop->GetPackPointer(), stop->GetPackSize());
     while (receive(socket, &kind) && kind != "RTS_" + type) {}
+  } else if (mode == "move") {
+    if (argc < 18) return 2;
+    igtl::Matrix4x4 matrix = {{0, 0, 0, 0}, {0, 0, 0, 0}, {0, 0, 0, 0}, {0, 0, 0, 1}};
+    for (int i = 0; i < 12; ++i) matrix[i / 4][i % 4] = static_cast<float>(std::atof(argv[6 + i]));
+    igtl::TransformMessage::Pointer m = igtl::TransformMessage::New();
+    m->SetDeviceName(argv[5]);
+    m->SetMatrix(matrix);
+    m->Pack();
+    socket->Send(m->GetPackPointer(), m->GetPackSize());
+    for (int i = 0; i < std::atoi(argv[4]) && receive(socket); ++i) {}
   } else if (mode == "ask") {
     igtl::MessageBase::Pointer question;
     std::string type = argv[4];

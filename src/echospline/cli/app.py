@@ -23,7 +23,7 @@ COMMANDS = {
     "study": "Regenerate the paper's study: Fig. 2, 3a, 3b, tables (CSV, JSON) and one self-contained report.html.",
     "live": "Steer the needle in the browser and see the tissue move.",
     "page": "Write a scene as one file that simulates: it opens by a double click, offline, on a laptop or a phone.",
-    "sessions": "Training sessions: list, export, import, score again, make a cine.",
+    "sessions": "Training sessions: list, learning curves, export, import, score again, make a cine.",
     "link": "Join the network of 3D Slicer and PLUS: transforms move the needle, the deforming image comes back.",
     "reconstruct": "Make a volume from a tracked sweep: every picture is put where the probe was, and small gaps are filled.",
     "recorded": "Simulate a recorded procedure again and compare every picture with the recorded one.",

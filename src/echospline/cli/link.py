@@ -31,7 +31,8 @@ def link(
         str,
         typer.Argument(
             metavar="[IMAGE_OR_SCENARIO]",
-            help="an image, cine or DICOM file, sample:calf, or a scenario (.toml)",
+            help="an image, cine or DICOM file, sample:calf, or a scenario (.toml); a volume is a scenario with [space], "
+            "sample:kidney or sample:spine",
         ),
     ] = "sample:calf",
     port: Annotated[
@@ -99,6 +100,14 @@ def link(
             metavar="MM", help="distance from plane and image beyond which the needle moves no tissue"
         ),
     ] = 10.0,
+    place: Annotated[
+        str,
+        typer.Option(
+            metavar="axial|file|lps",
+            help="where a volume stands in the reference frame: in Slicer's axial view, at its file's coordinates (as "
+            "reconstruct and PLUS write them), or at those read as LPS; a transform SceneToReference goes before",
+        ),
+    ] = "axial",
     target: Annotated[
         list[str] | None,
         typer.Option(
@@ -132,7 +141,7 @@ def link(
 ) -> None:
     """Join the network of 3D Slicer and PLUS: transforms move the needle, the deforming image comes back.
 
-    Images go out at the scenario's frames per second (--fps). docs/slicer.md shows how to connect step by step.
+    In a volume they move the probe as well, and the picture of its plane comes back. Images go out at the scenario's frames per second (--fps). docs/slicer.md shows how to connect step by step.
     """
     from threadpoolctl import threadpool_limits
 
@@ -162,15 +171,33 @@ def link(
 
     def staged(
         chosen: scenario_room.Scenario, start: Path, points: list[tuple[float, float]]
-    ) -> openigtlink.Stage:
+    ) -> openigtlink.Stage | openigtlink.SpatialStage:
+        if scenario_room.is_spatial(chosen):
+            from echospline.cli.link_space import make_spatial_stage
+
+            return make_spatial_stage(chosen, start, place)
         made = make_stage(chosen, start, orientation, rate, points)
         say([*made.image.notes, *chosen.label_notes(start)], "note")
         say(scenario_room.size_doubts(made.image.grid))
         return made
 
+    if scenario_room.is_spatial(scenario):
+        from echospline.cli.link_space import refuse_options_of_the_plane
+
+        refuse_options_of_the_plane(
+            {
+                "--orientation": (orientation, "MF", "the picture is made in MF: leave it out"),
+                "--beam": (beam, 4.0, "the slice's thickness is space.probe.elevation"),
+                "--target": (target, None, "no points are followed yet: leave it out"),
+                "--mesh-rate": (mesh_rate, 5.0, "no mesh is sent yet: leave it out"),
+                "--rate": (rate, 120.0, "model and picture step together, --fps times per second"),
+            }
+        )
+    elif place != "axial":
+        raise InputError(f"--place {place} belongs to volumes; a picture's place is ImageToReference")
     stage = staged(scenario, folder, [_point(text) for text in target or ()])
 
-    def load_named(name: str) -> openigtlink.Stage:
+    def load_named(name: str) -> openigtlink.Stage | openigtlink.SpatialStage:
         assert scenarios is not None  # otherwise it is not passed on
         if Path(name).name != name or not name.endswith(".toml"):
             raise InputError(f"a scenario is named NAME.toml, without folders; got {name!r}")
@@ -249,7 +276,11 @@ def oriented(image: scene_room.UltrasoundImage, orientation: str) -> scene_room.
     return scene_room.UltrasoundImage(np.ascontiguousarray(pixels), image.grid, image.source, image.notes)
 
 
-def _summary(stage: openigtlink.Stage) -> str:
+def _summary(stage: openigtlink.Stage | openigtlink.SpatialStage) -> str:
+    if isinstance(stage, openigtlink.SpatialStage):
+        from echospline.cli.link_space import summary_in_space
+
+        return summary_in_space(stage)
     x0, x1, y0, y1 = stage.image.grid.extent
     newest = stage.engine.snapshots.latest()
     name = newest.value.model if newest else ""

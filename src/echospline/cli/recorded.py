@@ -41,6 +41,31 @@ def recorded(
             metavar="FILE.xml", help="PLUS device set file with the calibration that the recording lacks"
         ),
     ] = None,
+    volume: Annotated[
+        str | None,
+        typer.Option(
+            metavar="VOLUME",
+            help="replay probe and needle in this volume (a file, sample:kidney, sample:spine or a scenario with [space])",
+        ),
+    ] = None,
+    place: Annotated[
+        str,
+        typer.Option(
+            metavar="axial|file|lps",
+            help="where the volume stands in the reference frame: in Slicer's axial view, at its file's coordinates (as "
+            "reconstruct and PLUS write them), or at those read as LPS",
+        ),
+    ] = "axial",
+    reference: Annotated[
+        str, typer.Option(metavar="FRAME", help="frame in which the volume stands")
+    ] = "Reference",
+    face: Annotated[
+        str | None,
+        typer.Option(
+            metavar="COLUMN,ROW",
+            help="pixel in the middle of the probe's face, for a volume  [default: middle of the first row]",
+        ),
+    ] = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="print the comparison as JSON, nothing else")
     ] = False,
@@ -51,7 +76,23 @@ def recorded(
     The first good frame is the tissue at rest, the tracked transforms are the needle's path; model and mesh come from the
     options. Writes `resimulated.igs.mha` and `comparison.csv`: for each frame the correlation of the recorded picture with
     the simulated one, and with the first frame (the result without a simulation).
+
+    With --volume the tracked probe moves through the volume as well, and the files are those of `simulate` (cine,
+    `displacement.npz` with the plane of every frame, `scenario.toml` ...) and `comparison.csv`. The picture is as large as the
+    recorded one, unless the scenario has a probe.
     """
+    if volume is not None:
+        from echospline.cli.recorded_space import recorded_in_volume
+
+        recorded_in_volume(
+            file, volume, out, changes or {}, place=place, reference=reference, face=face, needle_frame=needle_frame,
+            needle_axis=needle_axis, config=config, as_json=as_json,
+        )  # fmt: skip
+        return
+    if place != "axial" or face is not None or reference != "Reference":
+        raise InputError(
+            "--place, --face and --reference belong to a volume: give --volume, or leave them out"
+        )
     import numpy as np
     from threadpoolctl import threadpool_limits
 
@@ -91,7 +132,7 @@ def recorded(
                         "correlation_still": correlation(image.pixels, seen),
                     }
                 )
-        _write(out / "comparison.csv", rows)
+        write_table(out / "comparison.csv", rows)
     told = {
         "recording": file.name,
         "frames": len(rows),
@@ -121,7 +162,14 @@ def correlation(first: scene_room.Pixels, second: scene_room.Pixels) -> float:
     return float((a * b).sum() / scale) if scale > 0 else 0.0
 
 
-def _write(path: Path, rows: list[dict[str, float]]) -> None:
+def write_table(path: Path, rows: list[dict[str, float]]) -> None:
+    """Write rows as CSV.
+
+    Raises
+    ------
+    InputError
+        If there are none.
+    """
     if not rows:
         raise InputError("nothing was simulated")
     text = io.StringIO()

@@ -70,7 +70,7 @@ def read_volume(path: str | Path, depth: str = "y", *, limit: float = LIMIT) -> 
         raise InputError(f"{path} has voxels that are not finite numbers: replace them before use")
     spacing = _spacing(path, recording.spacing, lengths, turned=any("turned" in n for n in recording.notes))
     volume = Volume(voxels, spacing, source=path.name)
-    return _along_frame(volume, flat.reshape(3, 3)).with_depth(depth)
+    return along_frame(volume, flat.reshape(3, 3)).with_depth(depth)
 
 
 def _spacing(
@@ -90,8 +90,8 @@ def _spacing(
     return plane[0], plane[1], third
 
 
-def _along_frame(volume: Volume, direction: Floats) -> Volume:
-    """Swap and reverse axes so that each lies along the nearest one of the frame."""
+def along_frame(volume: Volume, direction: Floats) -> Volume:
+    """Swap and reverse axes so that each lies along the nearest one of the frame that directions (3, 3) refer to."""
     if not np.isfinite(direction).all():
         raise InputError(f"{volume.source} has directions that are not finite numbers: {direction.tolist()}")
     axes = np.argmax(np.abs(direction), axis=0)  # for x, y and z of the file: which axis of the frame

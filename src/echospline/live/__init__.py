@@ -7,10 +7,11 @@ from echospline.menu import on_demand
 if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.live.engine import LiveEngine, ModelFactory
     from echospline.live.motion import follow
-    from echospline.live.pacer import Metronome, Pacer
+    from echospline.live.pacer import Metronome, Pacer, Stepped
     from echospline.live.recorder import Recorder, Trace
     from echospline.live.slot import Numbered, Slot
     from echospline.live.snapshot import Command, Snapshot
+    from echospline.live.space_engine import SpatialEngine, SpatialSnapshot
 else:
     on_demand(__name__)
 
@@ -24,6 +25,9 @@ __all__ = [
     "Recorder",
     "Slot",
     "Snapshot",
+    "SpatialEngine",
+    "SpatialSnapshot",
+    "Stepped",
     "Trace",
     "follow",
 ]

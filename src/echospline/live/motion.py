@@ -8,8 +8,9 @@ import numpy as np
 
 from echospline.live.snapshot import Command
 from echospline.mechanics.motion import follow as towards
-from echospline.mechanics.protocol import TissueModel
-from echospline.scene import NeedlePose
+from echospline.mechanics.motion import follow_in_space as towards_in_space
+from echospline.mechanics.protocol import SpatialTissueModel, TissueModel
+from echospline.scene import NeedlePose, SpatialPose
 
 
 def follow(pose: NeedlePose, command: Command, dt: float, lag: float, fastest: float) -> NeedlePose:
@@ -44,6 +45,13 @@ def follow(pose: NeedlePose, command: Command, dt: float, lag: float, fastest: f
     return towards(pose, command.entry, command.tip, dt, lag, fastest)
 
 
+def follow_in_space(
+    pose: SpatialPose, command: SpatialPose, dt: float, lag: float, fastest: float
+) -> SpatialPose:
+    """Move a needle in space towards its command; as `follow`."""
+    return towards_in_space(pose, command.entry, command.tip, dt, lag, fastest)
+
+
 def insert_straight(
     model: TissueModel[Any], pose: NeedlePose, speed: float = 10.0, stride: float = 0.5
 ) -> object:
@@ -67,4 +75,18 @@ def insert_straight(
         s = depth * k / steps
         tip = (pose.entry[0] + s * axis[0], pose.entry[1] + s * axis[1])
         state = model.advance(state, NeedlePose(pose.entry, tip, speed), depth / steps / speed)
+    return state
+
+
+def insert_straight_in_space(
+    model: SpatialTissueModel[Any], pose: SpatialPose, speed: float = 10.0, stride: float = 0.5
+) -> object:
+    """Return the state of a model in space after a straight insertion to a pose; as `insert_straight`."""
+    state = model.rest()
+    depth, axis = pose.depth, np.array(pose.axis)
+    steps = int(np.ceil(depth / stride))
+    for k in range(1, steps + 1):
+        x, y, z = np.array(pose.entry) + depth * k / steps * axis
+        tip = float(x), float(y), float(z)
+        state = model.advance(state, SpatialPose(pose.entry, tip, speed), depth / steps / speed)
     return state

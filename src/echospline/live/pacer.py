@@ -5,8 +5,20 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from typing import Protocol
 
-from echospline.live.engine import LiveEngine
+
+class Stepped(Protocol):
+    """What a pacer steps: an engine, in the plane or in space."""
+
+    @property
+    def period(self) -> float:
+        """Time between steps, s."""
+        ...
+
+    def step(self) -> object:
+        """Advance by one period."""
+        ...
 
 
 class Metronome:
@@ -41,7 +53,7 @@ class Metronome:
 class Pacer:
     """Steps an engine by the clock in a thread of its own, until stopped; use it as a context."""
 
-    def __init__(self, engine: LiveEngine, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, engine: Stepped, clock: Callable[[], float] = time.monotonic) -> None:
         self.engine, self._clock = engine, clock
         self._stop = threading.Event()
         self._metronome = Metronome(engine.period, clock())

@@ -6,7 +6,8 @@ import ctypes
 
 from echospline import _native as core
 from echospline.errors import InputError
-from echospline.scene import NeedlePose
+from echospline.scene import NeedlePose, SpatialPose
+from echospline.scene.space import Triple
 
 
 def follow(
@@ -42,12 +43,27 @@ def follow(
     InputError
         If a number is out of its range or not finite.
     """
-    now, after = core.Pose(entry=(*pose.entry, 0.0), tip=(*pose.tip, 0.0)), core.Pose(dt=dt)
-    command = core.Command((*entry, 0.0), (*tip, 0.0), lag, fastest)
+    after = _followed((*pose.entry, 0.0), (*pose.tip, 0.0), (*entry, 0.0), (*tip, 0.0), dt, lag, fastest)
+    return NeedlePose((after.entry[0], after.entry[1]), (after.tip[0], after.tip[1]), after.speed)
+
+
+def follow_in_space(
+    pose: SpatialPose, entry: Triple, tip: Triple, dt: float, lag: float, fastest: float
+) -> SpatialPose:
+    """Move a needle in space one step towards its command; as `follow`, with entry and tip (x, y, z) in mm."""
+    after = _followed(pose.entry, pose.tip, entry, tip, dt, lag, fastest)
+    return SpatialPose(tuple(after.entry), tuple(after.tip), after.speed)
+
+
+def _followed(
+    now_entry: Triple, now_tip: Triple, entry: Triple, tip: Triple, dt: float, lag: float, fastest: float
+) -> core.Pose:
+    now, after = core.Pose(entry=now_entry, tip=now_tip), core.Pose(dt=dt)
+    command = core.Command(entry, tip, lag, fastest)
     status = core.library().echospline_follow(ctypes.byref(now), ctypes.byref(command), ctypes.byref(after))
     if status != core.Status.OK:
         raise InputError(
             "a needle follows finite positions in mm, in steps of a positive dt, with a lag of zero or more and a positive "
             f"fastest speed; got entry {entry}, tip {tip}, dt {dt} s, lag {lag} s, fastest {fastest} mm/s"
         )
-    return NeedlePose((after.entry[0], after.entry[1]), (after.tip[0], after.tip[1]), after.speed)
+    return after

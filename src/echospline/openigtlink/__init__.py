@@ -12,7 +12,7 @@ if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.openigtlink.plus import read_calibration
     from echospline.openigtlink.pose import Position, Transform
     from echospline.openigtlink.session import Session
-    from echospline.openigtlink.stage import Rates, SessionOptions, Stage
+    from echospline.openigtlink.stage import Rates, SessionOptions, SpatialStage, Stage
     from echospline.openigtlink.text import Status, String
     from echospline.openigtlink.transforms import Naming
 else:
@@ -29,6 +29,7 @@ __all__ = [
     "Rates",
     "Session",
     "SessionOptions",
+    "SpatialStage",
     "Stage",
     "Status",
     "String",

@@ -10,7 +10,7 @@ from xml.sax.saxutils import quoteattr
 
 from echospline.errors import InputError
 from echospline.openigtlink.message import Message
-from echospline.openigtlink.stage import Stage
+from echospline.openigtlink.stage import AnyStage
 from echospline.openigtlink.text import UNKNOWN_ERROR, CommandMessage, CommandReply, Status, String
 
 LONGEST = 16 * 1024
@@ -90,7 +90,7 @@ def _named(name: str, argument: str) -> Order:
     return Order(NAMES[key], argument.strip())
 
 
-def carry_out(order: Order, stage: Stage) -> str:
+def carry_out(order: Order, stage: AnyStage) -> str:
     """Carry out an order, other than to load a scenario; returns a sentence for the peer.
 
     Raises
@@ -98,14 +98,9 @@ def carry_out(order: Order, stage: Stage) -> str:
     InputError
         If the stage has no such model or no planned insertion.
     """
-    engine, insertion = stage.engine, stage.insertion
+    engine = stage.engine
     if order.name == "start":
-        if insertion is None:
-            raise InputError("there is no planned insertion to start: load a scenario that has one")
-        engine.freeze(False)
-        times = (k * engine.period for k in range(1, int(insertion.duration / engine.period) + 1))
-        engine.replay(insertion.pose(float(insertion.times[0]) + t) for t in times)
-        return f"the planned insertion runs, {insertion.duration:.1f} s"
+        return f"the planned insertion runs, {stage.start():.1f} s"
     if order.name == "stop":
         engine.freeze(True)
         return "time stands still"

@@ -14,7 +14,7 @@ from echospline.openigtlink.pose import Position, QuaternionTransform, Transform
 from echospline.openigtlink.tools import QuaternionTrackingData, Tool, TrackingData
 from echospline.openigtlink.transforms import Naming
 from echospline.picture import Drawing, NeedleEcho
-from echospline.scene import ImagingPlane, Pixels, RegularGrid, Visible
+from echospline.scene import Floats, ImagingPlane, Pixels, RegularGrid, Visible
 
 ORIENTATION = {"UltrasoundImageOrientation": "MF"}
 """Metadata of every image: columns grow to the marked side of the probe, rows away from it."""
@@ -87,8 +87,13 @@ def image_message(
 
 
 def needle_messages(snapshot: Snapshot, plane: ImagingPlane, naming: Naming, now: float) -> list[Message]:
-    """Build the messages of the needle in the picture: TRANSFORM for all; the others go to peers that asked for them."""
-    matrix, name = plane.tip_matrix(snapshot.pose), f"{naming.needles[0]}To{naming.reference}"
+    """Build the messages of the needle in the picture; see `tip_messages`."""
+    return tip_messages(plane.tip_matrix(snapshot.pose), naming, now)
+
+
+def tip_messages(matrix: Floats, naming: Naming, now: float) -> list[Message]:
+    """Build the messages of a needle by the matrix of its tip: TRANSFORM for all; the others go to peers that asked for them."""
+    name = f"{naming.needles[0]}To{naming.reference}"
     x, y, z = (float(v) for v in matrix[:3, 3])
     position, quaternion = (x, y, z), quaternion_of(matrix)
     # the tool's own name: the C++ library 1.11 reads none of 20 characters, and NeedleTipToReference has that many

@@ -5,24 +5,22 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
-import time
 from collections.abc import Callable
-from dataclasses import replace
 from types import TracebackType
 from typing import Self
 
 import numpy as np
 
 from echospline.errors import EchosplineError, InputError
-from echospline.live import LiveEngine, Metronome, Pacer
+from echospline.live import LiveEngine, Pacer, SpatialEngine
+from echospline.openigtlink.followed import Fault, Followed, FollowedPlane
+from echospline.openigtlink.followed_volume import FollowedVolume
 from echospline.openigtlink.link import Link
 from echospline.openigtlink.message import Message, Request
 from echospline.openigtlink.orders import Order, answer, carry_out, order_of
-from echospline.openigtlink.painter import Painter
 from echospline.openigtlink.peer import Peer
 from echospline.openigtlink.pose import Position, Transform
-from echospline.openigtlink.stage import SessionOptions, Stage
-from echospline.openigtlink.status import status_of
+from echospline.openigtlink.stage import AnyStage, SessionOptions, SpatialStage
 from echospline.openigtlink.text import Status
 from echospline.openigtlink.tools import (
     STREAMED_ON_REQUEST,
@@ -32,15 +30,12 @@ from echospline.openigtlink.tools import (
     TrackingData,
     transform_name,
 )
-from echospline.openigtlink.transforms import Located, Tracking
-from echospline.scene import Floats, NeedlePose
+from echospline.scene import Floats, ImagingPlane, NeedlePose, SpatialPose
 
 log = logging.getLogger("echospline.openigtlink")
 
 STATUS_KEY = "TransformStatus"
 """Metadata of a transform in which PLUS gives its status."""
-ARRIVES = 1.0
-"""mm; a needle that is first tracked deeper than this is placed there instead of pushed there."""
 
 
 class Session:
@@ -51,41 +46,40 @@ class Session:
 
     Parameters
     ----------
-    stage : Stage
+    stage : Stage or SpatialStage
         The simulated scene.
     options : SessionOptions
         Options of link and pictures.
     load : callable, optional
         Builds the stage of the name in a LoadScenario order; without it such orders are refused.
     moved : callable, optional
-        Called with the pose whenever the tracker moves the needle, and whether tracking of it has just begun (a page
-        follows it).
+        Called with the pose whenever the tracker moves the needle, and whether tracking of it has just begun (a page follows it).
     tracked : callable, optional
         Called with a sentence when the needle's tracking is lost, and with an empty one when it returns.
+    placed : callable, optional
+        Called with the probe's plane whenever the tracker moves it in a volume.
     """
 
     def __init__(
         self,
-        stage: Stage,
+        stage: AnyStage,
         options: SessionOptions | None = None,
-        load: Callable[[str], Stage] | None = None,
-        moved: Callable[[NeedlePose, bool], None] | None = None,
+        load: Callable[[str], AnyStage] | None = None,
+        moved: Callable[[NeedlePose | SpatialPose, bool], None] | None = None,
         tracked: Callable[[str], None] | None = None,
+        placed: Callable[[ImagingPlane], None] | None = None,
     ) -> None:
         self.options = options or SessionOptions()
         self.port = 0
         """Port actually bound, once the context is entered."""
-        self._load, self._moved, self._tracked = load, moved, tracked
+        self._load, self._moved, self._tracked, self._placed = load, moved, tracked, placed
         self._stop = threading.Event()
         self._ready = threading.Event()
         self._error: BaseException | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._following = False
         self._followed = 0.0
-        self._away = True
-        self._stage, self._pacer = stage, Pacer(stage.engine)
-        self._tracking = Tracking(stage.image.grid, self.options.looks.naming, self.options.silence)
-        self._located = self._tracking.locate()
+        self._scene, self._pacer = self._followed_of(stage), Pacer(stage.engine)
         self._link = Link(
             self._received,
             self.status,
@@ -133,15 +127,18 @@ class Session:
         return tuple(peer.name for peer in self._link.peers)
 
     @property
-    def engine(self) -> LiveEngine:
+    def engine(self) -> LiveEngine | SpatialEngine:
         """The engine in use."""
-        return self._stage.engine
+        return self._scene.stage.engine
 
     def status(self) -> Status:
         """Return the answer to GET_STATUS: the needle, the model and faults."""
-        newest = self._stage.engine.snapshots.latest()
-        assert newest is not None  # an engine begins with one
-        return status_of(newest.value, self._located, self._stage.image.grid, self.options.reach)
+        return self._scene.status()
+
+    def _followed_of(self, stage: AnyStage) -> Followed:
+        if isinstance(stage, SpatialStage):
+            return FollowedVolume(stage, self.options, self._moved, self._placed)
+        return FollowedPlane(stage, self.options, self._moved)
 
     # ---- the link's thread
 
@@ -194,7 +191,7 @@ class Session:
     def _put(self, message: Message, name: str, matrix: Floats) -> None:
         now = self._now()
         try:
-            self._tracking.put(name, matrix, message.metadata.get(STATUS_KEY, ""), now)
+            self._scene.put(name, matrix, message.metadata.get(STATUS_KEY, ""), now)
         finally:
             self._follow_soon()
 
@@ -218,27 +215,17 @@ class Session:
         if self._following or self._loop is None:
             return
         self._following = True
-        pause = self._followed + self._stage.engine.period - self._loop.time()
+        pause = self._followed + self._scene.stage.engine.period - self._loop.time()
         self._loop.call_later(max(0.0, pause), self._follow)
 
     def _follow(self) -> None:
         self._following, self._followed = False, self._now()
-        located = self._locate()
-        needle = located.needle
-        if needle is None or located.held:
-            return
-        engine, pose = self._stage.engine, needle.pose(self._stage.image.grid, self.options.reach)
-        # A needle that is inserted when tracking begins was not pushed there in this step.
-        appears, self._away = self._away and pose is not None and pose.depth > ARRIVES, pose is None
-        pose = pose or engine.home
-        (engine.place if appears else engine.command)(pose.entry, pose.tip)
-        if self._moved is not None:
-            self._moved(pose, appears)
+        self._locate()
+        self._scene.follow()
 
-    def _locate(self) -> Located:
+    def _locate(self) -> Fault:
         """Locate plane and needle; a change of their fault is logged once, and told once to the pages."""
-        before, now = self._located, self._tracking.locate(self._now())
-        self._located = now
+        before, now = self._scene.located, self._scene.locate(self._now())
         if (now.fault, now.about) != (before.fault, before.about):
             if now.fault == "":
                 log.info("tracking is back: %s", before.about or "the needle")
@@ -254,7 +241,7 @@ class Session:
             asyncio.get_running_loop().create_task(self._load_stage(peer, message, order.argument))
             return
         try:
-            text, done = carry_out(order, self._stage), True
+            text, done = carry_out(order, self._scene.stage), True
         except InputError as error:
             text, done = str(error), False
         peer.answer(answer(message, text, done=done))
@@ -274,9 +261,7 @@ class Session:
             peer.answer(answer(message, f"{name} failed: {type(error).__name__}: {error}", done=False))
             return
         old, self._pacer = self._pacer, Pacer(stage.engine)
-        self._tracking = Tracking(stage.image.grid, self.options.looks.naming, self.options.silence)
-        self._located = replace(self._tracking.locate(), needle=None)
-        self._stage, self._away = stage, True
+        self._scene = self._followed_of(stage)
         self._pacer.start()
         await asyncio.to_thread(old.stop)
         peer.answer(answer(message, f"{name} is loaded", done=True))
@@ -289,10 +274,8 @@ class Session:
 
     def _draw(self) -> None:
         self._ready.wait()
-        painter = Painter(self.options.looks, self.options.reach, self.options.rates)
-        clock = Metronome(1.0 / self.options.rates.image, time.monotonic())
-        while not self._stop.wait(clock.wait(time.monotonic())):
-            messages = painter.messages(self._stage, self._located)
+        while not self._stop.is_set():
+            messages = self._scene.messages(self._stop)
             if messages is None:
                 continue
             if self._loop is None or self._loop.is_closed():

@@ -1,17 +1,30 @@
-"""The scene that a session simulates, its rates, and its options for peers."""
+"""The scene that a session simulates, in the plane or in space, its rates, and its options for peers."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from math import isfinite
 
+import numpy as np
+
 from echospline.errors import InputError
-from echospline.live import LiveEngine
+from echospline.live import LiveEngine, SpatialEngine
 from echospline.openigtlink.header import PORT
 from echospline.openigtlink.link import LinkLimits
 from echospline.openigtlink.outgoing import Looks
 from echospline.openigtlink.tools import STREAMED_ON_REQUEST
-from echospline.scene import Insertion, Reach, UltrasoundImage
+from echospline.scene import (
+    AXIAL,
+    Floats,
+    ImagingPlane,
+    Insertion,
+    PlanePath,
+    Reach,
+    SpatialInsertion,
+    UltrasoundImage,
+)
+
+_NO_PLAN = "there is no planned insertion to start: load a scenario that has one"
 
 
 @dataclass(frozen=True)
@@ -34,6 +47,72 @@ class Stage:
     engine: LiveEngine
     models: tuple[str, ...] = ()
     insertion: Insertion | None = None
+
+    def start(self) -> float:
+        """Play the planned insertion; returns its duration, s.
+
+        Raises
+        ------
+        InputError
+            If there is none.
+        """
+        if self.insertion is None:
+            raise InputError(_NO_PLAN)
+        engine, planned = self.engine, self.insertion
+        engine.freeze(False)
+        times = (k * engine.period for k in range(1, int(planned.duration / engine.period) + 1))
+        engine.replay(planned.pose(float(planned.times[0]) + t) for t in times)
+        return planned.duration
+
+
+@dataclass(frozen=True, eq=False)
+class SpatialStage:
+    """The simulated scene in space.
+
+    Parameters
+    ----------
+    engine : SpatialEngine
+        Tissue, needle and probe in their volume.
+    models : tuple of str
+        Names that the engine can be switched to.
+    insertion : SpatialInsertion, optional
+        The path for the order `start`.
+    planes : PlanePath, optional
+        The probe's path for it.
+    place : ndarray, shape (4, 4)
+        Scene to reference frame (RAS), mm, until a transform ``SceneToReference`` says otherwise; a rotation and a translation.
+
+    Raises
+    ------
+    InputError
+        If the place is no such motion.
+    """
+
+    engine: SpatialEngine
+    models: tuple[str, ...] = ()
+    insertion: SpatialInsertion | None = None
+    planes: PlanePath | None = None
+    place: Floats = field(default_factory=lambda: np.array(AXIAL))
+
+    def __post_init__(self) -> None:
+        ImagingPlane(self.place)  # checks it
+
+    def start(self) -> float:
+        """Play the planned insertion, and the probe's path where there is one; returns its duration, s.
+
+        Raises
+        ------
+        InputError
+            If there is none.
+        """
+        if self.insertion is None:
+            raise InputError(_NO_PLAN)
+        self.engine.freeze(False)
+        self.engine.play(self.insertion, self.planes)
+        return max(self.insertion.duration, self.planes.duration if self.planes else 0.0)
+
+
+AnyStage = Stage | SpatialStage
 
 
 @dataclass(frozen=True)

@@ -19,13 +19,12 @@ from echospline.scene import (
     as_transform,
     chain_between,
     frames_of,
+    rigid_fault,
     transform_between,
 )
 
 MOST = 100
 """Transforms stored at most; a tracker has a dozen."""
-RIGID = 0.02
-"""Deviation of axes from length 1 and from right angles (1.1 degrees); trackers round to four digits, scales are gross."""
 FARTHEST = 1e4
 """mm; no tracker sees a tool at 10 m."""
 _STAYS = "the needle stays where it was"
@@ -49,6 +48,8 @@ class Naming:
         Plane of the image until a transform from it arrives.
     calibration : mapping of str to ndarray
         Fixed transforms (``NeedleTipToNeedle``, ``ImageToProbe``).
+    probe, scene : str
+        In space: the probe's frame and the volume's.
     """
 
     needles: tuple[str, ...] = ("NeedleTip", "StylusTip")
@@ -57,6 +58,8 @@ class Naming:
     axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
     plane: ImagingPlane = field(default_factory=lambda: ImagingPlane(AXIAL))
     calibration: Mapping[str, Floats] = field(default_factory=dict)
+    probe: str = "Probe"
+    scene: str = "Scene"
 
 
 @dataclass(frozen=True)
@@ -100,26 +103,23 @@ class _Heard:
     unit_settled: bool = False
 
 
-class Tracking:
-    """Stores the newest transform of each name; `locate` combines them.
+class Received:
+    """The newest transform of each name, and what its tracker says of it.
 
-    A transform whose status is not OK, or that no tool can have, leaves the one before it in force, and the needle where
-    it was. Times are those of the receiver: the clocks of trackers are not set.
+    A transform whose status is not OK, or that no tool can have, leaves the one before it in force. Times are those of the
+    receiver: the clocks of trackers are not set.
 
     Parameters
     ----------
-    grid : RegularGrid
-        The image's pixels.
     naming : Naming
         Names of frames.
     silence : float
-        Seconds without a transform after which the needle counts as stale.
+        Seconds without a transform after which a tool counts as stale.
     """
 
-    def __init__(self, grid: RegularGrid, naming: Naming, silence: float = 0.5) -> None:
-        self.grid, self.naming, self.silence = grid, naming, silence
+    def __init__(self, naming: Naming, silence: float = 0.5) -> None:
+        self.naming, self.silence = naming, silence
         self._heard: dict[str, _Heard] = {}
-        self._good: TrackedNeedle | None = None
         for name, matrix in naming.calibration.items():
             frames_of(name)
             as_transform(matrix)
@@ -183,7 +183,7 @@ class Tracking:
                 "expected 4 x 4 finite numbers with the last row 0 0 0 1, and a unit quaternion where there is one"
             )
         if self.naming.image in frames_of(name):
-            return "", ""
+            return _picture_fault(matrix)
         kind, reason = rigid_fault(matrix)
         if kind:
             return kind, reason
@@ -200,6 +200,71 @@ class Tracking:
             )
         return "", ""
 
+    @property
+    def any(self) -> bool:
+        """Whether a transform has come."""
+        return bool(self._heard)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the transforms that have come."""
+        return tuple(self._heard)
+
+    def known(self, standing: Mapping[str, Floats] | None = None) -> dict[str, Floats]:
+        """Return the transforms in force: those that stand without a word, those of the calibration, those received."""
+        heard = {k: h.matrix for k, h in self._heard.items() if h.matrix is not None}
+        return {**(standing or {}), **self.naming.calibration, **heard}
+
+    def spoken(self) -> tuple[str, str, str]:
+        """Return kind, name and reason of the first transform that is invalid or refused; empty if there is none."""
+        for name, heard in self._heard.items():
+            if heard.status or heard.kind:
+                fault, reason = self._spoken(name, heard)
+                return fault, name, reason
+        return "", "", ""
+
+    def fault(self, chain: tuple[str, ...], now: float) -> tuple[str, str, str]:
+        """Return kind, name and reason if the tool at the end of this chain of transforms is not known now."""
+        heard = {name: self._heard[name] for name in chain if name in self._heard}
+        for name, one in heard.items():
+            if one.status or one.kind:
+                return (fault := self._spoken(name, one))[0], name, fault[1]
+        # a transform that came once is a setting, not a stream: it may rest as long as another one goes on
+        streams = {name: one for name, one in heard.items() if one.count > 1} or heard
+        if streams:
+            name, oldest = min(streams.items(), key=lambda item: item[1].at)
+            if now - oldest.at > self.silence:
+                return "Stale", name, f"stale: {name} has been silent for {now - oldest.at:.1f} s"
+        return "", "", ""
+
+    @staticmethod
+    def _spoken(name: str, heard: _Heard) -> tuple[str, str]:
+        if heard.status:
+            return "Invalid", f"{name} is {heard.status}"
+        return "Refused", f"{name} is refused: {heard.refusal}"
+
+
+class Tracking:
+    """Combines the newest transforms into the image's plane and the needle in it.
+
+    Parameters
+    ----------
+    grid : RegularGrid
+        The image's pixels.
+    naming : Naming
+        Names of frames.
+    silence : float
+        Seconds without a transform after which the needle counts as stale.
+    """
+
+    def __init__(self, grid: RegularGrid, naming: Naming, silence: float = 0.5) -> None:
+        self.grid, self.naming, self.received = grid, naming, Received(naming, silence)
+        self._good: TrackedNeedle | None = None
+
+    def put(self, name: str, matrix: Floats, status: str = "", now: float = 0.0) -> None:
+        """Store a transform; see `Received.put`."""
+        self.received.put(name, matrix, status, now)
+
     def locate(self, now: float = 0.0) -> Located:
         """Locate plane and needle by the newest transforms.
 
@@ -209,7 +274,7 @@ class Tracking:
             The receiver's clock, s.
         """
         n = self.naming
-        known = dict(n.calibration) | {k: h.matrix for k, h in self._heard.items() if h.matrix is not None}
+        known = self.received.known()
         plane, trouble = n.plane, ""
         image = transform_between(known, n.image, n.reference)
         if image is not None:
@@ -222,67 +287,36 @@ class Tracking:
             if found is None:
                 continue
             tip, chain = found
-            fault, about, reason = self._fault(chain, tip, now)
-            if self._good is None and not rigid_fault(tip)[0]:
+            fault, about, reason = self.received.fault(chain, now)
+            kind, described = rigid_fault(tip)
+            if kind and not fault:
+                fault, about, reason = "Refused", chain[0], f"{' * '.join(chain)}: {described}"
+            if self._good is None and not kind:
                 self._good = plane.see(tip, n.axis)
             if fault:
                 return Located(plane, self._good, f"{reason}; {_STAYS}", fault, about, held=True)
             self._good = plane.see(tip, n.axis)
             return Located(plane, self._good, trouble, "Transforms" if trouble else "")
-        for name, heard in self._heard.items():
-            if heard.status or heard.kind:
-                fault, reason = self._spoken(name, heard)
-                return Located(plane, None, f"{reason}; no tracked needle yet", fault, name)
-        if self._heard and not trouble:
+        fault, about, reason = self.received.spoken()
+        if fault:
+            return Located(plane, None, f"{reason}; no tracked needle yet", fault, about)
+        if self.received.any and not trouble:
             trouble = (
                 f"no transform leads from {' or '.join(n.needles)} to {n.reference}; "
                 f"there are {', '.join(sorted(known))}"
             )
         return Located(plane, None, trouble, "Transforms" if trouble else "")
 
-    def _fault(self, chain: tuple[str, ...], tip: Floats, now: float) -> tuple[str, str, str]:
-        """Return kind, name and reason if the needle at the end of this chain is not known now."""
-        heard = {name: self._heard[name] for name in chain if name in self._heard}
-        for name, one in heard.items():
-            if one.status or one.kind:
-                return (fault := self._spoken(name, one))[0], name, fault[1]
-        # a transform that came once is a setting, not a stream: it may rest as long as another one goes on
-        streams = {name: one for name, one in heard.items() if one.count > 1} or heard
-        if streams:
-            name, oldest = min(streams.items(), key=lambda item: item[1].at)
-            if now - oldest.at > self.silence:
-                return "Stale", name, f"stale: {name} has been silent for {now - oldest.at:.1f} s"
-        kind, reason = rigid_fault(tip)
-        return ("Refused", chain[0], f"{' * '.join(chain)}: {reason}") if kind else ("", "", "")
 
-    @staticmethod
-    def _spoken(name: str, heard: _Heard) -> tuple[str, str]:
-        if heard.status:
-            return "Invalid", f"{name} is {heard.status}"
-        return "Refused", f"{name} is refused: {heard.refusal}"
+def _picture_fault(matrix: Floats) -> tuple[str, str]:
+    """Return kind and reason if no picture can have this matrix, whose columns may hold its spacing."""
+    largest = float(np.abs(matrix).max())
+    if largest > FARTHEST:
+        return "far", f"expected the picture's place in mm; got {largest:.4g}, farther than any tracker sees"
+    return "", ""
 
 
 def is_valid(status: str) -> bool:
     """Test whether a tracker's status lets its transform be used: OK, a pressed switch, or none given."""
     word = status.strip().upper().removeprefix("TOOL_")
     return word in ("", "OK") or (word.startswith("SWITCH") and word.endswith("_IS_ON"))
-
-
-def rigid_fault(matrix: Floats) -> tuple[str, str]:
-    """Return kind and description of what keeps a finite 4 x 4 matrix from being a motion of a rigid tool; empty if nothing does.
-
-    Axes count as perpendicular and of length 1 within `RIGID`.
-    """
-    axes = matrix[:3, :3]
-    largest = np.abs(axes).max()
-    lengths = np.linalg.norm(axes, axis=0) if largest < 1e6 else np.full(3, largest)
-    said = ", ".join(f"{v:.4g}" for v in lengths)
-    if lengths.min() < 1e-6:
-        return "empty", f"expected axes of length 1; got {said}: the tool is probably not seen"
-    if np.abs(lengths - 1.0).max() > RIGID:
-        return "scaled", f"expected axes of length 1; got {said}: a tool's transform has no scale, send mm"
-    if np.abs(axes.T @ axes - np.diag(lengths**2)).max() > RIGID:
-        return "skewed", "expected perpendicular axes: a tool's transform has no skew"
-    if np.linalg.det(axes) < 0:
-        return "mirrored", "expected a right-handed rotation; got a mirrored one: one axis has the wrong sign"
-    return "", ""

@@ -93,6 +93,7 @@ def run_space(
     *,
     progress: Callable[[int, int], None] | None = None,
     doubts: Sequence[str] = (),
+    watch: Callable[[SpatialFrame], None] | None = None,
 ) -> dict[str, Any]:
     """Simulate a scenario in space and write its results.
 
@@ -112,6 +113,8 @@ def run_space(
         Called with (frames done, number of frames).
     doubts : sequence of str
         What was said before the run.
+    watch : callable, optional
+        Called with every frame.
 
     Returns
     -------
@@ -159,6 +162,8 @@ def run_space(
                 record.add(frame.displacement, frame.time, frame.pose, frame.plane, frame.places)
             frame.milliseconds["write"] = 1e3 * (perf_counter() - since)
             tally.add(frame)
+            if watch is not None:
+                watch(frame)
             if progress is not None:
                 progress(frame.index + 1, expected)
     files = [SUFFIX[name] for name in dict.fromkeys(output.formats)]

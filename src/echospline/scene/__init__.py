@@ -26,6 +26,14 @@ if TYPE_CHECKING:  # the menu, loaded on demand
         Tissue,
         VolumeLabel,
     )
+    from echospline.scene.tracked_space import (
+        nearest_rigid,
+        picture_plane,
+        pose_in_space,
+        probe_angles,
+        rigid_fault,
+        tip_frame,
+    )
     from echospline.scene.transducer import FWHM, TRANSDUCERS, Transducer
     from echospline.scene.transform import as_transform, chain_between, frames_of, transform_between
     from echospline.scene.volume import Volume, Voxels
@@ -81,7 +89,13 @@ __all__ = [
     "fourier_frequencies",
     "frames_of",
     "is_number",
+    "nearest_rigid",
+    "picture_plane",
+    "pose_in_space",
+    "probe_angles",
     "probe_plane",
+    "rigid_fault",
     "shades",
+    "tip_frame",
     "transform_between",
 ]

@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from echospline.errors import InputError
 
@@ -66,8 +66,9 @@ def prepare(path: Path) -> None:
         If it cannot be opened or written.
     """
     with opened(path) as database:
-        if _version(database, path) == SCHEMA_VERSION:
-            return
+        with _transaction(database, "DEFERRED"):  # number and tables of one moment, while others may be at it
+            if _version(database, path) == SCHEMA_VERSION:
+                return
         _log_ahead(database)
         with written(database):
             version = _version(database, path)  # another process may have been quicker
@@ -97,7 +98,13 @@ def opened(path: Path) -> Iterator[sqlite3.Connection]:
 @contextmanager
 def written(database: sqlite3.Connection) -> Iterator[None]:
     """Write in one transaction, after waiting for other writers."""
-    database.execute("BEGIN IMMEDIATE")
+    with _transaction(database, "IMMEDIATE"):
+        yield
+
+
+@contextmanager
+def _transaction(database: sqlite3.Connection, kind: Literal["DEFERRED", "IMMEDIATE"]) -> Iterator[None]:
+    database.execute(f"BEGIN {kind}")
     try:
         yield
     except BaseException:
