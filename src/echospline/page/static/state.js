@@ -155,7 +155,7 @@ function slid(state, mm, across) {
 /** Probe over the needle: along it, or across it at its tip. @param {State} state @param {string} name @returns {State} */
 function viewedBy(state, name) {
   if (!state.held) return state;
-  const { needle } = state, [dx, , dz] = axisOf({ ...needle, angle: Math.min(needle.angle, 89) }), far = Math.max(needle.depth, EXPECTED);
+  const { needle } = state, [dx, , dz] = axisOf({ ...needle, angle: Math.min(needle.angle, 89) }), far = isOut(needle) ? EXPECTED : needle.depth;
   const yaw = (Math.atan2(-dz, dx) * 180) / Math.PI, part = name === "along" ? far / 2 : far, flat = Math.cos((needle.angle * Math.PI) / 180);
   const way = flat < 0 ? -part : part, size = Math.hypot(dx, dz) || 1;
   const [x, z] = [needle.entry[0] + (way * Math.abs(flat) * dx) / size, needle.entry[2] + (way * Math.abs(flat) * dz) / size];
