@@ -19,7 +19,7 @@ import { core, manifestInSpace, packedInSpace, stateInSpace } from "../node/made
 
 const after = (state, ...actions) => actions.reduce(next, state), say = wordsOf("en");
 const near = (a, b, within = 1e-9) => assert.ok(Math.abs(a - b) < within, `${a} is not ${b}`);
-const live = (state, more = {}) => ({ entry: state.needle.entry, tip: tipOf(state.needle), speed: 0, watched: [4, 15, 1], expert: null, picture: { columns: 101, rows: 101, spacing: [0.3, 0.3], origin: [-15, 0] }, ...more });
+const live = (state, more = {}) => ({ entry: state.needle.entry, tip: tipOf(state.needle), speed: 0, watched: [4, 15, 1], expert: null, motion: [], picture: { columns: 101, rows: 101, spacing: [0.3, 0.3], origin: [-15, 0] }, ...more });
 
 test("looking along, the picture holds the whole needle, wherever it heads", () => {
   for (const degrees of [-150, -40, 0, 33, 90, 170]) {
@@ -146,6 +146,10 @@ test("the picture changes with the plane and with the tissue", async () => {
   for (let k = 0; k < 120; ++k) engine.step({ entry: [-8, 0, 0], tip: [-2, 8, 0] });
   assert.notDeepEqual(engine.grey().slice(), first);
   assert.ok(Math.hypot(...engine.displacementAt([-3, 7, 0])) > 0.05);
+  const motion = engine.motion({ x0: -15, y0: 0, x1: 15, y1: 30 }, { low: [-18, 0, -18], high: [18, 36, 18] }), [x, y] = [motion[40], motion[41]];
+  const u = engine.displacementAt([x, y, 0]);
+  near(motion[42] - x, u[0]);
+  near(motion[43] - y, u[1]);
 });
 
 test("messages from outside are read, and others change nothing", () => {
