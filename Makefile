@@ -37,7 +37,7 @@ wheels: setup
 demo: setup
 	$(BIN)/echospline demo --out out/demo
 
-live: setup
+live: setup wasm
 	$(BIN)/echospline live
 
 check: setup core-check

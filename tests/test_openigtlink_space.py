@@ -547,14 +547,11 @@ def test_link_in_a_volume_from_the_command_line(tmp_path):
         (["link", "sample:spine", "--place", "moon"], "--place is one of axial, file, lps"),
         (["link", "sample:calf", "--place", "lps"], "--place lps belongs to volumes"),
         (["link", "sample:spine", "--config", "examples/plus-echospline.xml"], "ImageToProbe: expected the picture's 0.12"),
-        (["live", "sample:kidney"], "echospline link sample:kidney"),
     ],
 )  # fmt: skip
 def test_what_makes_no_sense_in_space_gets_one_sentence(words, sentence, request, monkeypatch):
     monkeypatch.chdir(request.config.rootpath)
-    result = CliRunner().invoke(
-        app, [*words, *(["--duration", "1", "--port", "0"] if words[0] == "link" else [])]
-    )
+    result = CliRunner().invoke(app, [*words, "--duration", "1", "--port", "0"])
     assert isinstance(result.exception, InputError)
     assert sentence in str(result.exception)
     assert str(result.exception).count("\n") == 0
@@ -679,3 +676,27 @@ def test_the_shipped_device_set_moves_probe_and_needle_from_another_librarys_ser
         process.terminate()
         process.wait(20)
         server.stop()
+
+
+def test_pages_follow_probe_and_needle_of_a_tracker_in_a_volume(tmp_path):
+    """`echospline live VOLUME --link`: what the tracker does to both is told to every page."""
+    from echospline.viewer import steer, turn  # noqa: PLC0415
+    from live_scene import listening, running, waited  # noqa: PLC0415
+
+    with running(tmp_path) as (address, _, served), listening(address) as page:
+        waited(served, 1)
+        with Session(
+            make_stage(),
+            QUICK,
+            moved=lambda pose, new: steer(served, pose, new),
+            placed=lambda plane: turn(served, plane.matrix.ravel()),
+        ) as session:
+            console = Console(session.port)
+            console.send(probe_message(PLANE))
+            told = np.array(page.hear("plane")["plane"]).reshape(4, 4)
+            np.testing.assert_allclose(told, PLANE.matrix, atol=1e-5)
+            console.send(needle_message(DEEP))
+            needle = page.hear("tip")
+            np.testing.assert_allclose([needle["entry"], needle["tip"]], [DEEP.entry, DEEP.tip], atol=1e-4)
+            assert needle["appears"]
+            console.close()

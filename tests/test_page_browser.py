@@ -594,6 +594,8 @@ def test_a_volume_opens_offline_with_the_probe_in_the_other_hand(opened, volume_
     page = ready(opened(size, path=volume_file))
     assert picture(page).std() > 10
     assert page.evaluate("document.documentElement.scrollWidth") <= SIZES[size][0]
+    start = page.locator("#start").bounding_box()
+    assert start["y"] + start["height"] <= SIZES[size][1]
     along = picture(page)
     page.keyboard.press("z")
     until(page, "document.getElementById('stage').dataset.plane.split(' ')[3] === '90.00'")

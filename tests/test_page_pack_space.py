@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from echospline.scenario.space_models import build_spatial_model
 from echospline.scenario.space_scene import spatial_tissue
 from echospline.scene import NeedlePose, Probe, SpatialPose, Volume, probe_plane
 from test_page_pack import changed, put
+from test_page_replay import NODE, WASM
 
 RNG = np.random.default_rng(9)
 
@@ -323,3 +325,35 @@ def test_a_tip_is_in_the_picture_where_the_probe_sees_it_and_its_slice_is_thick_
     assert 100 < wanted.sum() < 2900
     edge = np.abs(local[:, 0]) > probe.width / 2 - 0.4 if shape == "linear" else np.zeros(3000, bool)
     np.testing.assert_array_equal(seen[~edge], wanted[~edge])
+
+
+@pytest.mark.skipif(NODE is None or not WASM.exists(), reason="Node or echospline.wasm is missing")
+@pytest.mark.parametrize("kind", ["green", "elastic"])
+def test_every_metric_of_the_page_in_space_is_that_of_the_replay(pack, kind, tmp_path):
+    (tmp_path / "scene.pack").write_bytes(pack.to_bytes())
+    entry, probe = list(pack.manifest.needle.entry), pack.manifest.probe.pose
+    target = list(pack.manifest.exercises[0].target.centre)
+    rng = np.random.default_rng(3)
+    hands = [[[entry, entry, 10, probe], [entry, target, 150, probe]]]
+    for _ in range(7):
+        x, z = rng.uniform(-3, 3, 2)
+        begin = [float(x), 0.0, float(z)]
+        hand = [[begin, begin, 15, probe]]
+        for _ in range(rng.integers(2, 6)):
+            tip = [float(v) for v in rng.uniform((-6, 3, -4), (6, 14, 4))]
+            held = [float(v) for v in np.array(probe) + rng.normal(0, (1, 0, 1.5, 20, 4, 4))]
+            hand.append([begin, tip, int(rng.integers(20, 90)), held])
+        hands.append([*hand, [begin, begin, 40, probe]] if rng.random() < 0.4 else hand)
+    done = subprocess.run(
+        [NODE, "tests/node/record_session.mjs", str(tmp_path / "scene.pack"), kind, json.dumps(hands)],
+        cwd=page_scene.ROOT, capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    found = [verify(pack, session) for session in parsed_sessions(done.stdout.encode(), "page")]
+    assert [one.differences for one in found] == [()] * len(hands)
+    scores = [one.score for one in found]
+    assert len({round(s.picture_time, 2) for s in scores}) > 4
+    assert len({s.redirections for s in scores}) > 2
+    assert max(s.target_shift for s in scores) > 0.05
+    assert min(s.final_error for s in scores) < 3.0
+    assert found[2].session.planes is not None

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import threading
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
 from PIL import Image
 from playwright.sync_api import expect
+from websockets.sync.client import connect
 
-from echospline.page import packed
-from echospline.scene import NeedlePose
-from echospline.viewer import Scene, Settings, announce, steer
+from echospline.page import packed, packed_space
+from echospline.scene import NeedlePose, probe_plane
+from echospline.viewer import Scene, Settings, announce, steer, turn
 from live_scene import free_port, running
 from page_scene import image, scenario
 from test_page_browser import CHROMIUM, FLAGS, SECONDS, SIZES, WASM, depth, picture, push, ready, until
+from test_page_space import opened as volume_scene
 
 pytestmark = [
     pytest.mark.skipif(
@@ -185,3 +188,28 @@ def test_the_page_itself_carries_no_scene_and_the_same_policy(server, visit):
     page = visit(server[0])
     assert page.evaluate("document.getElementById('scene')") is None
     assert page.evaluate("fetch('https://example.org/').then(() => 'sent', () => 'refused')") == "refused"
+
+
+def test_a_phone_turns_the_probe_and_a_tracker_places_it(tmp_path, visit):
+    made = packed_space(volume_scene())
+    with running(tmp_path, pack=made, fem=None) as (address, _, app):
+        page = visit(address)
+        held = "document.getElementById('stage').dataset.plane"
+        expect(page.locator('[data-served="fem"]')).to_be_hidden()
+        page.locator('[data-do="phone"]').click()
+        link = urlsplit(page.locator("#phone-link").get_attribute("href"))
+        where = f"ws://{link.netloc}/phone?{link.query}"
+        with connect(where) as phone:
+            expect(page.locator("#phone")).to_be_hidden()
+            until(page, "document.getElementById('notice').textContent.includes('phone is connected')")
+            phone.send('{"turn": [0, 0, 0]}')
+            for k in range(1, 11):
+                phone.send(f'{{"turn": [{3 * k}, {k}, 0]}}')
+                page.wait_for_timeout(30)
+            until(page, f"Math.abs(Number({held}.split(' ')[3]) - 30) < 0.1")
+            assert abs(float(page.evaluate(held).split()[4]) - 10) < 0.1
+        until(page, "document.getElementById('notice').textContent.includes('phone is gone')")
+        turn(app, [3.0, 0.0, -2.0, 15.0, 5.0, -4.0])
+        until(page, f"{held} === '3.00 0.00 -2.00 15.00 5.00 -4.00'")
+        turn(app, probe_plane((1.0, 0.0, 2.0), -20.0, 6.0, 3.0).matrix.ravel())
+        until(page, f"{held} === '1.00 0.00 2.00 -20.00 6.00 3.00'")

@@ -12,7 +12,7 @@ import { freshState } from "../node/made_pack.mjs";
 
 const say = wordsOf("en"), after = (state, ...actions) => actions.reduce(next, state);
 const live = (more = {}) => ({
-  entry: [8, 0], tip: [13, 5], speed: 10, watched: [18.5, 9.25, 11, 5], expert: null,
+  entry: [8, 0], tip: [13, 5], speed: 10, watched: [18.5, 9.25, 11, 5], expert: null, motion: [10, 5, 10, 5, 12, 6, 13, 8],
   picture: { columns: 64, rows: 40, spacing: [0.5, 0.5], origin: [0, 0] }, ...more,
 });
 const texts = (list) => list.filter((command) => command.draw === "text").map((command) => command.text);
@@ -79,6 +79,13 @@ test("helps are drawn or not, one by one", () => {
   assert.equal(circles(of("rings"), "#ffd166").length, 0);
   assert.ok(!of("guide").some((command) => command.draw === "line" && command.dash?.[0] === 7));
   assert.ok(!texts(of("readouts")).some((text) => text.includes("mm/s")));
+});
+
+test("motion is drawn from where tissue lay to where it is, and only where it has moved", () => {
+  const state = after(freshState(), { do: "help", name: "motion" }), view = viewOf(state.view, state.extent), drawn = drawList(state, live(), say).filter((command) => command.ink === "#ffb36b");
+  assert.equal(drawn.length, 2);
+  assert.deepEqual(drawn[0].points, [view.toScreen([12, 6]), view.toScreen([13, 8])]);
+  assert.equal(drawList(freshState(), live(), say).filter((command) => command.ink === "#ffb36b").length, 0);
 });
 
 test("flipping mirrors everything but the writing, and the dot goes to the other side", () => {

@@ -36,7 +36,7 @@ test("what the exercise says of the entry comes before the examination's rule", 
 
 test("help is taken away while the exercise is recorded, and comes back", () => {
   const state = started({ help: false });
-  assert.deepEqual(helpsOf(state), { guide: false, rings: false, readouts: false, body: false });
+  assert.deepEqual(helpsOf(state), { guide: false, rings: false, readouts: false, motion: false, body: false });
   assert.deepEqual(helpsOf(next(state, { do: "stop" })), state.help);
 });
 

@@ -52,7 +52,7 @@ test("an attempt begins with the needle out and counts its time", () => {
 });
 
 test("an examination shows no help, and an exercise can take help away", () => {
-  const none = { guide: false, rings: false, readouts: false, body: false };
+  const none = { guide: false, rings: false, readouts: false, motion: false, body: false };
   const examined = after(freshState(), { do: "examination" }, { do: "start", lot: 0 });
   assert.deepEqual(helpsOf(examined), none);
   assert.deepEqual(helpsOf(after(examined, { do: "help", name: "rings" })), none, "and it cannot be asked back");

@@ -61,3 +61,23 @@ export function freshState(change = {}) {
 }
 
 export const engine = () => Engine.open(core, packed());
+
+/** Manifest of a small scene in space, without its arrays. */
+export const manifestInSpace = () => ({
+  ...manifest(), image: undefined, volume: { shape: [20, 20, 20], spacing: [2, 2, 2], origin: [-19, 0, -19], voxels: "voxels" },
+  probe: {
+    shape: "linear", columns: 101, rows: 101, spacing: [0.3, 0.3], origin: [-15, 0], radius: 60, opening: 60, depth: 30, pose: [0, 0, 0, 0, 0, 0], elevation: 0.75,
+    elevation_depth: 18, element_height: 5,
+  },
+  mesh: { shape: [7, 7, 7], spacing: [6, 6, 6], origin: [-18, 0, -18] },
+  models: [{ name: "elastic", label: "Elastic", sentence: {}, kind: "landmarks", options: { dimension: 3, kernel: 1, shape: [7, 7, 7], spacing: [6, 6, 6], origin: [-18, 0, -18], anchor_spacing: 9, contact_spacing: 3 }, arrays: {} }],
+  needle: { entry: [-8, 0, 0], direction: [0.6, 0.8, 0], lag: 0.02, fastest: 200, echo: {} },
+  exercises: [{ ...structuredClone(EXERCISE), target: { centre: [4, 15, 1], radius: 3 }, vessels: [] }],
+});
+
+export const packedInSpace = (given = manifestInSpace()) => packed(given, { voxels: speckle(8000) });
+
+/** State of the small scene in space on a stage of 800 x 600. */
+export function stateInSpace() {
+  return initialState(readPack(packedInSpace()));
+}

@@ -19,6 +19,7 @@ from echospline import page as page_room
 from echospline import scenario as scenario_room
 from echospline import scene as scene_room
 from echospline.cli.link import address, make_stage
+from echospline.cli.link_space import make_spatial_stage
 from echospline.cli.options import say, scenario_from, with_scenario_options
 from echospline.errors import InputError
 
@@ -127,8 +128,6 @@ def live(
     scenario, folder = scenario_from(source, changes or {})
     opened = None
     if scenario_room.is_spatial(scenario):
-        if link or link_connect:
-            raise InputError("live follows a tracker in scenes of the plane alone: leave --link out in space")
         opened = scenario_room.open_spatial(scenario, folder, own=False)
         say(opened.notes, "note")
         scene = viewer.Scene(page_room.packed_space(opened, language=language, rate=rate))
@@ -158,7 +157,9 @@ def live(
         stack.enter_context(threadpool_limits(limits=1))
         if link or link_connect:
             session = openigtlink.Session(
-                make_stage(scenario, folder, rate=rate),
+                make_stage(scenario, folder, rate=rate)
+                if opened is None
+                else make_spatial_stage(scenario, folder),
                 openigtlink.SessionOptions(
                     port=link_port,
                     connect=tuple(address(text) for text in link_connect or ()),
@@ -173,14 +174,14 @@ def live(
                 ),
                 moved=lambda pose, appears: viewer.steer(app, pose, appears),
                 tracked=lambda text: viewer.announce(app, text),
+                placed=lambda plane: viewer.turn(app, plane.matrix.ravel()),
             )
             stack.enter_context(session)
             console.print(f"OpenIGTLink on 127.0.0.1:{session.port}", highlight=False)
         viewer.serve(app, settings, ready)
     if viewer.unfinished(LAST_PATIENCE):
-        os._exit(
-            0
-        )  # everything is closed; a file that is read or a solver at work would crash an interpreter that ends
+        # Everything is closed; a file that is read or a solver at work would crash an interpreter that ends.
+        os._exit(0)
 
 
 def scene_of(

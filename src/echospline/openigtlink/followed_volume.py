@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Callable
 from threading import Event
 
 import numpy as np
@@ -38,10 +39,21 @@ class FollowedVolume:
         What is simulated.
     options : SessionOptions
         Of the session; `Reach.thickness`, `Rates.mesh` and `Looks.echo` belong to the plane: thickness and echo are the engine's here.
+    moved : callable, optional
+        Called with the needle's pose, and whether tracking of it has just begun.
+    placed : callable, optional
+        Called with the probe's plane.
     """
 
-    def __init__(self, stage: SpatialStage, options: SessionOptions) -> None:
+    def __init__(
+        self,
+        stage: SpatialStage,
+        options: SessionOptions,
+        moved: Callable[[SpatialPose, bool], None] | None = None,
+        placed: Callable[[ImagingPlane], None] | None = None,
+    ) -> None:
         self.stage, self.options = stage, options
+        self._moved, self._placed = moved, placed
         drawing = stage.engine.drawing
         self.grid = drawing.probe.grid
         low = np.array(drawing.volume.origin)
@@ -68,6 +80,8 @@ class FollowedVolume:
         if located.plane is not None and located.plane is not self._plane and not located.probe_held:
             self._plane = located.plane
             engine.move_probe(located.plane)
+            if self._placed is not None:
+                self._placed(located.plane)
         if located.needle is None or located.needle_held:
             return
         pose = pose_in_space(located.needle, *self._box, self.options.reach)
@@ -77,6 +91,8 @@ class FollowedVolume:
         if pose != self._pose or appears:
             self._pose = pose
             (engine.place if appears else engine.command)(pose.entry, pose.tip)
+            if self._moved is not None:
+                self._moved(pose, appears)
 
     def status(self) -> Status:
         """Describe needle, probe, model and faults."""

@@ -30,7 +30,7 @@ from echospline.openigtlink.tools import (
     TrackingData,
     transform_name,
 )
-from echospline.scene import Floats, NeedlePose
+from echospline.scene import Floats, ImagingPlane, NeedlePose, SpatialPose
 
 log = logging.getLogger("echospline.openigtlink")
 
@@ -53,10 +53,11 @@ class Session:
     load : callable, optional
         Builds the stage of the name in a LoadScenario order; without it such orders are refused.
     moved : callable, optional
-        Called with the pose whenever the tracker moves the needle in the plane, and whether tracking of it has just begun (a
-        page follows it).
+        Called with the pose whenever the tracker moves the needle, and whether tracking of it has just begun (a page follows it).
     tracked : callable, optional
         Called with a sentence when the needle's tracking is lost, and with an empty one when it returns.
+    placed : callable, optional
+        Called with the probe's plane whenever the tracker moves it in a volume.
     """
 
     def __init__(
@@ -64,13 +65,14 @@ class Session:
         stage: AnyStage,
         options: SessionOptions | None = None,
         load: Callable[[str], AnyStage] | None = None,
-        moved: Callable[[NeedlePose, bool], None] | None = None,
+        moved: Callable[[NeedlePose | SpatialPose, bool], None] | None = None,
         tracked: Callable[[str], None] | None = None,
+        placed: Callable[[ImagingPlane], None] | None = None,
     ) -> None:
         self.options = options or SessionOptions()
         self.port = 0
         """Port actually bound, once the context is entered."""
-        self._load, self._moved, self._tracked = load, moved, tracked
+        self._load, self._moved, self._tracked, self._placed = load, moved, tracked, placed
         self._stop = threading.Event()
         self._ready = threading.Event()
         self._error: BaseException | None = None
@@ -135,7 +137,7 @@ class Session:
 
     def _followed_of(self, stage: AnyStage) -> Followed:
         if isinstance(stage, SpatialStage):
-            return FollowedVolume(stage, self.options)
+            return FollowedVolume(stage, self.options, self._moved, self._placed)
         return FollowedPlane(stage, self.options, self._moved)
 
     # ---- the link's thread

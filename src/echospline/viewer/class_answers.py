@@ -152,9 +152,10 @@ def trace_csv(trace: Trace) -> str:
     """Write a session's trace as CSV: time, pose and the deformed target, one row per step."""
     out = io.StringIO()
     writer = csv.writer(out)
+    axes = "xyz"[: trace.dimension]
     writer.writerow(
-        ["time (s)", "entry_x (mm)", "entry_y (mm)", "tip_x (mm)", "tip_y (mm)", "speed (mm/s)",
-         "target_x (mm)", "target_y (mm)"]
+        ["time (s)", *(f"{what}_{axis} (mm)" for what in ("entry", "tip") for axis in axes), "speed (mm/s)",
+         *(f"target_{axis} (mm)" for axis in axes)]
     )  # fmt: skip
     for time, pose, watched in zip(trace.times, trace.poses, trace.watched, strict=True):
         writer.writerow([f"{time:.6f}", *(f"{v:.6f}" for v in (*pose, *watched[0]))])

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
-from echospline.scene import Floats, NeedlePose
+from echospline.scene import Floats, NeedlePose, SpatialPose
 
 FASTEST = 1 / 60
 """s between two messages of one kind to a page; what comes sooner replaces what waits."""
@@ -69,7 +69,7 @@ class Hub:
         """Return the pages of a key."""
         return [listener for listener in self.listeners if listener.key == key and key]
 
-    def steer(self, pose: NeedlePose, appears: bool) -> None:
+    def steer(self, pose: NeedlePose | SpatialPose, appears: bool) -> None:
         """Move the needle of every page; ``appears`` places it there, even if a later pose of the same moment says otherwise."""
         self._soon(self._steer, pose, appears)
 
@@ -82,7 +82,7 @@ class Hub:
         self.tracker = text
         self._soon(self._announce, text)
 
-    def _steer(self, pose: NeedlePose, appears: bool) -> None:
+    def _steer(self, pose: NeedlePose | SpatialPose, appears: bool) -> None:
         self._appears |= appears
         self._later(
             "needle",

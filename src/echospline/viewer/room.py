@@ -31,6 +31,8 @@ READ_AT_ONCE, STRAYS = 2, 4
 """Pictures decoded at a time, and decodings beyond their time after which no further one is begun."""
 COMPUTED_AT_ONCE, MOST_WAITING = 2, 64
 """Pages that finite elements follow at a time, and those that wait for it."""
+RECORDED_AT_ONCE = 4
+"""Recordings received and written as DICOM at a time; each is in memory, up to the size of an upload."""
 
 
 @dataclass
@@ -51,6 +53,7 @@ class Room:
     opening: dict[str, asyncio.Task[Scene | None]] = field(default_factory=dict)
     hub: Hub = field(default_factory=Hub)
     following: Turns = field(default_factory=lambda: Turns("finite elements", MOST_WAITING))
+    recordings: Turns = field(default_factory=lambda: Turns("recordings", RECORDED_AT_ONCE))
 
     @property
     def ending(self) -> Ending:

@@ -124,7 +124,7 @@ async def _followed(request: Request, scene: Scene, rows: Floats) -> Floats:
 async def dicom(request: Request) -> Response:
     """Answer frames of a page as a DICOM file."""
     room = room_of(request)
-    with room.uploads.turn(client_of(request)):
+    with room.recordings.turn(client_of(request)):
         data = await room.uploads.body(request, room.settings.uploads.size)
         file = await room.compute(lambda: aside(as_dicom, data, request.query_params.get("rate", "30")))
     return Response(

@@ -14,7 +14,7 @@ from starlette.middleware import Middleware
 from starlette.routing import Route, WebSocketRoute
 
 from echospline.errors import InputError
-from echospline.scene import Floats, NeedlePose
+from echospline.scene import Floats, NeedlePose, SpatialPose
 from echospline.viewer import routes, sockets
 from echospline.viewer.class_routes import Classroom, Instructor, class_routes
 from echospline.viewer.guard import Guard
@@ -84,14 +84,14 @@ def build_app(
     return app
 
 
-def steer(app: Starlette, pose: NeedlePose, appears: bool) -> None:
+def steer(app: Starlette, pose: NeedlePose | SpatialPose, appears: bool) -> None:
     """Move the needle of every page, as a tracker commands; any thread may call.
 
     Parameters
     ----------
     app : Starlette
         From `build_app`.
-    pose : NeedlePose
+    pose : NeedlePose or SpatialPose
         Pose of the needle.
     appears : bool
         Whether tracking of it has just begun: then it is placed there, not pushed there.

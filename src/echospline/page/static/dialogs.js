@@ -57,6 +57,7 @@ export function showSummary(state, session, trace, expert, past) {
     const value = score[name];
     return element("tr", {}, element("th", { textContent: say(name), scope: "row" }), element("td", { textContent: value === null ? "–" : `${printed(Number(value))} ${unit}` }));
   }));
+  byId("history").hidden = past.length < 2; // before anything is drawn: it changes the room
   openDialog("summary");
   const plot = plotOf(trace), other = expert && plotOf(expert);
   const marks = session.events.filter(([, kind]) => kind === "vessel").map(([step]) => ({ x: step / session.rate, colour: state.theme === "dark" ? "#ff8f8f" : "#b3261e" }));
@@ -67,7 +68,6 @@ export function showSummary(state, session, trace, expert, past) {
     ],
     xLabel: say("plot-time"), yLabel: "mm", level: exercise.target.radius, levelLabel: say("plot-radius"), marks,
   }, state.theme);
-  byId("history").hidden = past.length < 2;
   if (past.length >= 2) drawProgress("history-plot", state, past);
 }
 

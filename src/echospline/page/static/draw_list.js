@@ -23,18 +23,19 @@ import { viewOf } from "./view.js";
 /**
  * The tissue now, as the engine has it.
  * @typedef {{
- *   entry: ArrayLike<number>, tip: ArrayLike<number>, speed: number, watched: ArrayLike<number>, expert: { entry: ArrayLike<number>, tip: ArrayLike<number> } | null,
+ *   entry: ArrayLike<number>, tip: ArrayLike<number>, speed: number, watched: ArrayLike<number>, expert: { entry: ArrayLike<number>, tip: ArrayLike<number> } | null, motion: number[],
  *   picture: { columns: number, rows: number, spacing: Point, origin: Point }
  * }} Live
  */
 /** Words that are drawn, from the table of the language. @typedef {(key: string, values?: Record<string, string | number>) => string} Say */
 
-const INK = "#e8f1f5", QUIET = "#a9bac5", ACCENT = "#5fd4e0", TARGET = "#ffd166", VESSEL = "#ff7b7b", CALIPER = "#b8f28a", NOTE = "#ffe9b8", EXPERT = "#c9a4ff";
+const INK = "#e8f1f5", QUIET = "#a9bac5", ACCENT = "#5fd4e0", TARGET = "#ffd166", VESSEL = "#ff7b7b", CALIPER = "#b8f28a", NOTE = "#ffe9b8", EXPERT = "#c9a4ff", MOTION = "#ffb36b";
 const STAGES = { dark: { back: "#05070a", quiet: "#a9bac5", rule: "#5b6b77", from: "#27323b", to: "#4a5a66" }, light: { back: "#dfe6ea", quiet: "#45545e", rule: "#7b8b96", from: "#8b9aa5", to: "#5b6b77" } };
 const OUTSIDE = 34; // mm of shaft that is drawn above the skin
 const HUB_ROOM = 14; // CSS pixels between its end and the top of the stage
 const PLATE = "rgba(5, 8, 10, 0.5)";
 const SLICE = 2.5; // mm off the plane up to which a needle is drawn as lying in it
+const LEAST_ARROW = 1; // CSS pixels
 const FAR = 400; // mm that the guide reaches
 const LOW_TIME = 10; // s left at which the countdown is coloured
 const IN_TISSUE = 0.2; // mm of depth at which the tip has a ring
@@ -51,6 +52,7 @@ export function drawList(state, live, say) {
     ...probe(view, state, stage),
     { draw: "clip", area: view.area },
     ...(exercise && (helps.rings || unseen(state, shown)) ? rings(view, shown, helps.rings ? exercise : { ...exercise, vessels: [] }, say) : []),
+    ...(helps.motion ? arrows(view, live) : []),
     ...(helps.guide ? guide(view, shown) : []),
     ...(live.expert ? expertNeedle(view, plane, live.expert, say) : []),
     ...calipers(view, state),
@@ -132,6 +134,18 @@ function rings(view, { places }, exercise, say) {
     if (k === 0) drawn.push({ draw: "line", points: [[x - 3, y], [x + 3, y]], ink, width: 1.5, halo: true }, { draw: "line", points: [[x, y - 3], [x, y + 3]], ink, width: 1.5, halo: true });
     return [...drawn, { draw: "text", at: [x, y - r - 10], text: say(k ? "vessel" : "target"), ink, align: "center", size: 12 }];
   });
+}
+
+/** How the tissue has moved: from where a place lay to where it is. @param {View} view @param {Live} live @returns {DrawCommand[]} */
+function arrows(view, { motion }) {
+  /** @type {DrawCommand[]} */
+  const drawn = [];
+  for (let k = 0; k < motion.length; k += 4) {
+    const a = view.toScreen([motion[k], motion[k + 1]]), b = view.toScreen([motion[k + 2], motion[k + 3]]);
+    if (Math.hypot(b[0] - a[0], b[1] - a[1]) < LEAST_ARROW) continue;
+    drawn.push({ draw: "line", points: [a, b], ink: MOTION, width: 1.5, halo: true }, { draw: "circle", at: b, r: 2, ink: MOTION, width: 0, fill: MOTION });
+  }
+  return drawn;
 }
 
 /** Where the needle would go, as far as that is near the plane; a cross where it would pass through it. @param {View} view @param {Seen} seen @returns {DrawCommand[]} */

@@ -1,7 +1,7 @@
 // The engine: a pack's scene in the core, stepped and drawn. It knows no document and runs in node too.
 
 import { load } from "./../../_native/echospline.js";
-import { planeMatrix, planeOptions } from "./probe.js";
+import { planeMatrix, planeOptions, raised, turnedDown } from "./probe.js";
 import { readPack } from "./scene.js";
 
 /** @import { Core, Forced, Pose, Tissue } from "./../../_native/echospline.js" */
@@ -29,6 +29,7 @@ import { readPack } from "./scene.js";
 
 /** dB that the grey levels of a recorded picture are taken to span. */
 export const RECORDED_RANGE = 60;
+const MOTION_ACROSS = 16; // arrows over the width of the picture
 const OUT_OF_TISSUE = 1e-9; // mm; a shorter needle is not drawn, as in Python
 const STRAIGHT_SPEED = 10, STRAIGHT_STRIDE = 0.5; // mm/s and mm: how a new model is brought to the present pose
 
@@ -193,6 +194,24 @@ export class Engine {
     for (const part of [0.33, 0.66, 1]) for (const side of [-2, 0, 2]) points.push(...inside(low.map((_, d) => entry[d] + part * (tip[d] - entry[d]) + (d === 0 ? side : 0))));
     for (let k = 0; k < 16; ++k) points.push(...low.map((from, d) => from + (d === 0 ? (k % 4) + 0.5 : d === 1 ? Math.floor(k / 4) + 0.5 : 2) * 0.25 * (high[d] - from)));
     return [...Array.from(entry), ...Array.from(tip), ...Array.from(this.displacementAt(points))];
+  }
+
+  /** Places of the picture and where they have moved, as it sees them: flat [x, y, to x, to y], mm. @param {{ x0: number, y0: number, x1: number, y1: number }} extent @param {{ low: number[], high: number[] }} tissue */
+  motion({ x0, y0, x1, y1 }, { low, high }) {
+    const m = this.held && planeMatrix(this.held), gap = (x1 - x0) / MOTION_ACROSS, places = [], points = [];
+    for (let y = y0 + gap / 2; y < y1; y += gap) {
+      for (let x = x0 + gap / 2; x < x1; x += gap) {
+        const point = m ? raised(m, [x, y]) : [x, y];
+        if (point.some((value, d) => value < low[d] || value > high[d])) continue;
+        places.push([x, y]);
+        points.push(...point);
+      }
+    }
+    const moved = this.displacementAt(points), D = low.length;
+    return places.flatMap(([x, y], k) => {
+      const u = turnedDown(m, Array.from({ length: D }, (_, d) => moved[D * k + d]));
+      return [x, y, x + u[0], y + u[1]];
+    });
   }
 
   /** The picture now, grey. @returns {Uint8Array} a view, right until the next call into the core */

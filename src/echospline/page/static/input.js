@@ -33,7 +33,7 @@ const PROBE_HELD = {
 export const KEYS = {
   " ": "reset", c: "freeze", f: "flip", i: "invert", "+": "zoom-in", "=": "zoom-in", "-": "zoom-out", 0: "fit", g: "guide", o: "rings", u: "readouts",
   1: "model-0", 2: "model-1", 3: "model-2", 4: "model-3", m: "caliper", t: "note", Delete: "clear", p: "picture", v: "clip", e: "exercise", n: "another",
-  "?": "help", l: "sessions", k: "body", x: "along", z: "across", Enter: "mark", Escape: "escape",
+  "?": "help", l: "sessions", k: "body", j: "motion", x: "along", z: "across", Enter: "mark", Escape: "escape",
 };
 /** @type {Record<number, string>} */
 const BUTTONS = { 0: "exercise", 1: "reset", 2: "freeze", 3: "another" };

@@ -12,7 +12,7 @@ import { Panels, byId, inputOf, put } from "./panels.js";
 import { Renderer } from "./renderer.js";
 import { Served } from "./served.js";
 import { Server } from "./server.js";
-import { anglesOf, initialState, next, tipOf } from "./state.js";
+import { anglesOf, helpsOf, initialState, next, tipOf } from "./state.js";
 import { Store, keepChoices, keptChoices } from "./store.js";
 import { Attempt, attemptsLeft, attemptsMade, landmarksOf, planesOf, posesOf, seenOf } from "./training.js";
 import { LANGUAGES, wordsOf } from "./words.js";
@@ -111,7 +111,7 @@ async function showScene(packBytes, kept) {
   reel.frames = [];
   origin = { version: pack.version, core: "", title: pack.title, pack: "" };
   const { columns, rows, spacing, origin: first } = pack.probe ?? /** @type {NonNullable<typeof pack.image>} */ (pack.image);
-  live = { entry: engine.pose.entry, tip: engine.pose.tip, speed: 0, watched: [], expert: null, picture: { columns, rows, spacing: [spacing[0], spacing[1]], origin: [first[0], first[1]] } };
+  live = { entry: engine.pose.entry, tip: engine.pose.tip, speed: 0, watched: [], expert: null, motion: [], picture: { columns, rows, spacing: [spacing[0], spacing[1]], origin: [first[0], first[1]] } };
   panels.load(pack);
   fit();
   panels.show(state, attemptNumber);
@@ -210,7 +210,7 @@ function draw(now) {
   const pictured = !drawnState || engine.stale || drawnState.look !== state.look;
   const exercise = state.run?.exercise ?? state.replay?.exercise ?? state.exercises.find((one) => one.name === state.chosen);
   const { entry, tip, speed } = engine.pose;
-  live = { ...live, entry, tip, speed, watched: exercise ? watchedNow(landmarksOf(exercise)) : [], expert: film && state.replay ? film.expert() : null };
+  live = { ...live, entry, tip, speed, watched: exercise ? watchedNow(landmarksOf(exercise)) : [], expert: film && state.replay ? film.expert() : null, motion: helpsOf(state).motion ? engine.motion(state.extent, state) : [] };
   if (engine.stale) drawnSamples = engine.samples(state);
   if (pictured) {
     const colours = engine.draw(state.look);
@@ -353,6 +353,7 @@ const COMMANDS = {
   guide: () => act({ do: "help", name: "guide" }),
   rings: () => act({ do: "help", name: "rings" }),
   readouts: () => act({ do: "help", name: "readouts" }),
+  motion: () => act({ do: "help", name: "motion" }),
   body: () => act({ do: "help", name: "body" }),
   along: () => act({ do: "over", name: "along" }),
   across: () => act({ do: "over", name: "across" }),

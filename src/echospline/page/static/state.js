@@ -15,7 +15,7 @@ import { viewOf, zoomed } from "./view.js";
  */
 /** @typedef {{ a: Point, b: Point }} Caliper mm */
 /** @typedef {{ at: Point, text: string }} Note mm */
-/** @typedef {{ guide: boolean, rings: boolean, readouts: boolean, body: boolean }} Helps `body`: the small drawing of probe, plane and needle */
+/** @typedef {{ guide: boolean, rings: boolean, readouts: boolean, motion: boolean, body: boolean }} Helps `motion`: how the tissue has moved; `body`: the small drawing of probe, plane and needle */
 /** @typedef {"free" | "fixed" | "drawn"} EntryRule */
 /** @typedef {{ exercise: Exercise, examination: boolean, entryFixed: boolean, steps: number }} Run an attempt that is being recorded */
 /** @typedef {{ exercise: Exercise, model: string, length: number, at: number, speed: number, paused: boolean, events: [number, string][], expert: boolean }} Replay rows are steps */
@@ -49,7 +49,7 @@ export function initialState(pack, kept = {}) {
     extent, low: mesh.origin, high, probe, held: probe?.pose ?? null, rate: pack.rate, home, exercises: pack.exercises, models: pack.models.map((model) => model.name), needle: home,
     view: { width: 800, height: 600, zoom: 1, pan: [0, 0], flip: false, depth: extent.y1 - extent.y0, aside: probe ? BODY_SHARE : 0 },
     look: { gain: 0, timeGain: Array(TIME_GAINS).fill(0), dynamicRange: 60, invert: false },
-    help: { guide: true, rings: true, readouts: true, body: true }, tool: "needle", calipers: [], drawing: null, cursor: null, notes: [], model: pack.models[0].name,
+    help: { guide: true, rings: true, readouts: true, motion: false, body: true }, tool: "needle", calipers: [], drawing: null, cursor: null, notes: [], model: pack.models[0].name,
     frozen: false, comparing: false, chosen: pack.exercises[0]?.name ?? "", examination: false, entryRule: "free", run: null, replay: null, touched: false,
     language: "en", theme: "dark", ...kept,
   };
@@ -58,7 +58,7 @@ export function initialState(pack, kept = {}) {
 /** The helps that are drawn now: an examination shows none, nor does an exercise that takes them away. @param {State} state @returns {Helps} */
 export function helpsOf(state) {
   const off = state.run !== null && (state.run.examination || state.run.exercise.help === false);
-  return off ? { guide: false, rings: false, readouts: false, body: false } : state.help;
+  return off ? { guide: false, rings: false, readouts: false, motion: false, body: false } : state.help;
 }
 
 /** @param {NeedleState} needle */
@@ -155,7 +155,7 @@ function slid(state, mm, across) {
 /** Probe over the needle: along it, or across it at its tip. @param {State} state @param {string} name @returns {State} */
 function viewedBy(state, name) {
   if (!state.held) return state;
-  const { needle } = state, [dx, , dz] = axisOf({ ...needle, angle: Math.min(needle.angle, 89) }), far = Math.max(needle.depth, EXPECTED);
+  const { needle } = state, [dx, , dz] = axisOf({ ...needle, angle: Math.min(needle.angle, 89) }), far = isOut(needle) ? EXPECTED : needle.depth;
   const yaw = (Math.atan2(-dz, dx) * 180) / Math.PI, part = name === "along" ? far / 2 : far, flat = Math.cos((needle.angle * Math.PI) / 180);
   const way = flat < 0 ? -part : part, size = Math.hypot(dx, dz) || 1;
   const [x, z] = [needle.entry[0] + (way * Math.abs(flat) * dx) / size, needle.entry[2] + (way * Math.abs(flat) * dz) / size];
