@@ -649,11 +649,13 @@ def test_the_guide_says_where_a_needle_across_would_pass_and_the_numbers_how_far
     page = ready(opened(path=volume_file))
     push(page, 6)
     page.keyboard.press("z")
+    page.wait_for_timeout(150)
+    before = plane(page)[0]
     page.locator("#probe-0").focus()
     for _ in range(40):
         page.keyboard.press("ArrowRight")
     page.wait_for_timeout(300)
-    assert plane(page)[0] > 0
+    assert abs(plane(page)[0] - before - 4) < 0.2
     assert page.locator("#fault").is_hidden()
 
 
