@@ -649,11 +649,13 @@ def test_the_guide_says_where_a_needle_across_would_pass_and_the_numbers_how_far
     page = ready(opened(path=volume_file))
     push(page, 6)
     page.keyboard.press("z")
+    page.wait_for_timeout(150)
+    before = plane(page)[0]
     page.locator("#probe-0").focus()
     for _ in range(40):
         page.keyboard.press("ArrowRight")
     page.wait_for_timeout(300)
-    assert plane(page)[0] > 0
+    assert abs(plane(page)[0] - before - 4) < 0.2
     assert page.locator("#fault").is_hidden()
 
 
@@ -693,3 +695,18 @@ def test_an_attempt_with_both_hands_is_scored_replayed_and_verified_by_the_packa
     until(page, "Number(document.getElementById('stage').dataset.depth) > 8.5")
     page.wait_for_timeout(300)
     np.testing.assert_allclose(plane(page), end, atol=0.02)
+
+
+def test_a_gamepad_holds_needle_and_probe(opened, volume_file):
+    page = ready(opened(path=volume_file))
+    pad = "(axes, pressed) => { navigator.getGamepads = () => [{ connected: true, axes, buttons: Array.from({ length: 17 }, (_, k) => ({ pressed: pressed.includes(k) })) }]; }"
+    before = plane(page)
+    page.evaluate(f"({pad})([0, 0.6, 0, 0.8], [5])")
+    until(page, "Number(document.getElementById('stage').dataset.depth) > 4")
+    page.evaluate(f"({pad})([0, 0, 0, 0], [])")
+    page.wait_for_timeout(200)
+    after = plane(page)
+    assert after[2] > before[2] + 1
+    assert after[3] > before[3] + 3
+    page.evaluate(f"({pad})([0, 0, 0, 0], [1])")
+    until(page, "Number(document.getElementById('stage').dataset.depth) === 0")

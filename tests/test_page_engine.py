@@ -12,6 +12,7 @@ import pytest
 
 import page_scene
 from echospline.page import Pack, packed
+from echospline.page.exercise import default_exercises_space
 from echospline.picture import Drawing, NeedleEcho
 from echospline.scenario import Scenario, build_model
 from echospline.scene import NeedlePose
@@ -92,9 +93,13 @@ def test_the_needle_follows_the_hand_as_in_the_live_loop(tmp_path):
             k += 1
 
 
-def test_a_page_of_the_sample_starts_with_a_model_that_its_sentence_explains():
+def test_the_sample_explains_its_models_and_exercises_in_both_languages():
     scenario, image = Scenario().opened(Path(), eight_bit=True)
     pack = packed(scenario, image, Path())
+    words = (page_scene.ROOT / "src/echospline/page/static/words.js").read_text(encoding="utf-8")
+    for exercise in [*pack.manifest.exercises, *default_exercises_space((0, 0, 0), (40, 40, 40))]:
+        assert f'"{exercise.title}": "' in words, "an exercise that every scene is given has a German title"
+        assert f'"{exercise.goal}": "' in words
     for model in pack.manifest.models:
         assert set(model.sentence) == {"en", "de"}
         assert model.sentence["en"].endswith(".")

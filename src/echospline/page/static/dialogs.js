@@ -3,7 +3,7 @@
 import { LINES, drawChart } from "./chart.js";
 import { byId, element, inputOf, put } from "./panels.js";
 import { plotOf } from "./training.js";
-import { printed, wordsOf } from "./words.js";
+import { given, printed, wordsOf } from "./words.js";
 
 /** @import { Session } from "./training.js" */
 /** @import { Trace, Score } from "./scoring.js" */
@@ -48,7 +48,7 @@ export function reasonOf({ score, exercise, ended }, say) {
 export function showSummary(state, session, trace, expert, past) {
   const say = wordsOf(state.language), colours = LINES[state.theme], { score, exercise } = session;
   if (!score) return;
-  put(byId("summary-title"), exercise.title);
+  put(byId("summary-title"), given(exercise.title, state.language));
   const verdict = byId("verdict");
   put(verdict, say(score.passed ? "passed" : "failed"));
   verdict.className = score.passed ? "verdict passed" : "verdict failed";
@@ -89,7 +89,7 @@ export function showAttempts(state, sessions, expert, ask) {
   byId("no-sessions").hidden = sessions.length > 0;
   byId("progress").hidden = sessions.length === 0;
   /** @type {HTMLButtonElement} */ (byId("export-all")).disabled = /** @type {HTMLButtonElement} */ (byId("erase")).disabled = sessions.length === 0;
-  const titles = new Map(sessions.map((session) => [session.exercise.name, session.exercise.title])), trainees = [...new Set(sessions.map((session) => session.trainee))];
+  const titles = new Map(sessions.map((session) => [session.exercise.name, given(session.exercise.title, state.language)])), trainees = [...new Set(sessions.map((session) => session.trainee))];
   options("progress-of", [...titles]);
   options("progress-who", [["", say("everybody")], ...trainees.filter((name) => name).map((name) => /** @type {[string, string]} */ ([name, name]))]);
   byId("session-rows").replaceChildren(...[...sessions].reverse().map((session) => {
@@ -100,7 +100,7 @@ export function showAttempts(state, sessions, expert, ask) {
     beside.addEventListener("click", () => ask.expert(session));
     const { score } = session, error = score?.final_error ?? null;
     const cells = [
-      String(session.attempt), new Date(session.started).toLocaleString(state.language, { dateStyle: "short", timeStyle: "short" }), session.trainee || "–", session.exercise.title,
+      String(session.attempt), new Date(session.started).toLocaleString(state.language, { dateStyle: "short", timeStyle: "short" }), session.trainee || "–", given(session.exercise.title, state.language),
       score ? say(score.passed ? "passed" : "failed") : "–", error === null ? "–" : `${printed(error)} mm`, score ? `${printed(score.time)} s` : "–",
     ];
     return element("tr", {}, ...cells.map((text) => element("td", { textContent: text })), element("td", {}, replay, beside));

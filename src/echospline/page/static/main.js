@@ -90,6 +90,7 @@ async function begin() {
   new ResizeObserver(fit).observe(byId("stage"));
   requestAnimationFrame(frame);
   await store.open();
+  if (/** @type {HTMLDialogElement} */ (byId("attempts")).open) sessions(); // asked for before they were read
   if (!server) return;
   served = new Served(server, {
     state: () => state, act, engine: () => engine, reel, store, named: () => named(), poses: () => Float64Array.from(since), load: (pack) => showScene(pack, { language: state.language, theme: state.theme }),

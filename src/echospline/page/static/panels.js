@@ -2,7 +2,7 @@
 
 import { MOST_TILT } from "./probe.js";
 import { deepestOf, helpsOf, isOut, steerable } from "./state.js";
-import { printed, wordsOf } from "./words.js";
+import { given, printed, wordsOf } from "./words.js";
 
 /** @import { Live } from "./draw_list.js" */
 /** @import { Pack } from "./scene.js" */
@@ -101,7 +101,11 @@ export class Panels {
     for (const place of all("[data-placeholder]")) /** @type {HTMLInputElement} */ (place).placeholder = say(place.dataset.placeholder ?? "");
     for (const place of all(".tools button")) place.setAttribute("aria-label", place.querySelector("span")?.textContent ?? "");
     this.pack.models.forEach((model, k) => put(/** @type {HTMLElement} */ (byId("models").children[k].querySelector("span")), model.sentence[language] ?? model.sentence.en ?? ""));
-    this.pack.exercises.forEach((exercise, k) => put(/** @type {HTMLElement} */ (byId("exercises").children[k].querySelector("span")), exercise.goal));
+    this.pack.exercises.forEach((exercise, k) => {
+      const [title, goal] = ["strong", "span"].map((part) => /** @type {HTMLElement} */ (byId("exercises").children[k].querySelector(part)));
+      put(title, given(exercise.title, language));
+      put(goal, given(exercise.goal, language));
+    });
   }
 
   /** @param {State} state @param {number} attempt number of the running attempt */
@@ -124,7 +128,7 @@ export class Panels {
     byId("rule-row").hidden = !state.examination;
     inputOf("rule").value = state.entryRule;
     put(byId("start"), say(run ? "finish" : "start"));
-    put(byId("status"), run ? say("recording", { attempt, title: run.exercise.title }) : replay ? say("replaying", { title: replay.exercise.title }) : "");
+    put(byId("status"), run ? say("recording", { attempt, title: given(run.exercise.title, state.language) }) : replay ? say("replaying", { title: given(replay.exercise.title, state.language) }) : "");
     const helps = helpsOf(state), taken = run !== null && (run.examination || run.exercise.help === false);
     for (const box of all("[data-help]")) {
       /** @type {HTMLInputElement} */ (box).checked = helps[/** @type {"guide"} */ (box.dataset.help)];

@@ -101,6 +101,22 @@ const TABLE = {
 };
 export const LANGUAGES = ["en", "de"];
 
+/** Titles and goals of the exercises that every scene is given, where it brings none of its own: English to German. @type {Record<string, string>} */
+const GIVEN = {
+  "Hit the target": "Triff das Ziel", "Bring the tip into the ring. The tissue moves with the needle, and the target with it.": "Die Spitze in den Ring bringen. Das Gewebe geht mit der Nadel, und das Ziel mit ihm.",
+  "One straight path": "Ein gerader Weg", "Choose entry and angle well: hit the deep target without turning the needle inside the tissue.": "Einstich und Winkel gut wählen: das tiefe Ziel treffen, ohne die Nadel im Gewebe zu drehen.",
+  "Past the vessel": "Am Gefäß vorbei", "Reach the target behind the vessel without touching the vessel.": "Das Ziel hinter dem Gefäß erreichen, ohne das Gefäß zu berühren.",
+  "Find and hit the target": "Finde und triff das Ziel", "Find the target with the probe, keep the needle in the picture and bring the tip into the target.": "Das Ziel mit der Sonde finden, die Nadel im Bild halten und die Spitze ins Ziel bringen.",
+};
+
+/** A title or goal in a language: one that a scene brings stays as it is. @param {string} text @param {string} language */
+export function given(text, language) {
+  return (language === "de" && Object.hasOwn(GIVEN, text) && GIVEN[text]) || text;
+}
+
+/** What `given` translates, for the tests. */
+export const GIVEN_WORDS = Object.keys(GIVEN);
+
 /** Words of a language; a key that the table lacks is a fault of the page. @param {string} language */
 export function wordsOf(language) {
   const column = Math.max(0, LANGUAGES.indexOf(language));
