@@ -17,7 +17,7 @@ from echospline.scene import NeedlePose, probe_plane
 from echospline.viewer import Scene, Settings, announce, steer, turn
 from live_scene import free_port, running
 from page_scene import image, scenario
-from test_page_browser import CHROMIUM, FLAGS, SECONDS, SIZES, WASM, depth, picture, push, ready, until
+from test_page_browser import CHROMIUM, FLAGS, SECONDS, SIZES, WASM, picture, push, ready, until
 from test_page_space import opened as volume_scene
 
 pytestmark = [
@@ -149,8 +149,10 @@ def test_a_tracker_steers_the_needle_and_its_trouble_is_said(server, visit):
     thread = threading.Thread(target=track)
     thread.start()
     try:
-        until(page, "Number(document.getElementById('stage').dataset.depth) > 7.5")
-        assert abs(depth(page) - np.hypot(4, 7)) < 0.1
+        until(
+            page,
+            f"Math.abs(Number(document.getElementById('stage').dataset.depth) - {np.hypot(4, 7)}) < 0.02",
+        )
     finally:
         stop.set()
         thread.join()
