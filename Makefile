@@ -63,10 +63,11 @@ FUZZ_SECONDS := 60
 core-fuzz: setup # the C interface under random misuse, for FUZZ_SECONDS
 	$(BIN)/python core/tests/run.py --fuzz $(FUZZ_SECONDS)
 
+BROWSER := $(patsubst %,tests/test_%.py,viewer_page page_browser page_served class_view)
 test: setup wasm
 	tests/install-system
-	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile --ignore tests/test_viewer_page.py --ignore tests/test_page_browser.py --ignore tests/test_page_served.py
-	$(BIN)/python -m pytest tests/test_viewer_page.py tests/test_page_browser.py tests/test_page_served.py # a browser's event loop stays in its process
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile $(BROWSER:%=--ignore=%)
+	$(BIN)/python -m pytest $(BROWSER) # a browser's event loop stays in its process
 
 format: setup
 	$(BIN)/ruff format .
