@@ -121,7 +121,7 @@ struct SpaceField {
     for (int64_t first = 0; first < n; first += LANES) {
       const int here = static_cast<int>(smaller<int64_t>(LANES, n - first));
       double below[3 * LANES];
-      Floats p[3];
+      float p[3][LANES];
       for (int i = 0; i < LANES; ++i) {
         const double* point = points + 3 * (first + smaller(i, here - 1));
         for (int k = 0; k < 3; ++k) {
@@ -130,7 +130,7 @@ struct SpaceField {
         }
       }
       Sum3 u;
-      add_forces<TOP>(forces, count, poisson, p[0], p[1], p[2], u);
+      add_forces<TOP>(forces, count, poisson, load(p[0]), load(p[1]), load(p[2]), u);
       for (int i = 0; i < here; ++i) {
         double* to = out + 3 * (first + i);
         to[0] = u.x[i], to[1] = u.y[i], to[2] = u.z[i];
