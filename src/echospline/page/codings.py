@@ -6,6 +6,7 @@ All of it is integers and signs, so that every reader finds the same bits.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +45,9 @@ def residuals(voxels: Bytes, weights: Sequence[int]) -> Bytes:
     for k in range(len(voxels)):
         sums = np.zeros(voxels.shape[1:], np.int32)
         for (z, y, x), weight in zip(NEIGHBOURS, weights, strict=True):
-            sums += np.int32(weight) * padded[k + 1 - z, 1 - y : padded.shape[1] - y, 1 - x : padded.shape[2] - x]
+            sums += (
+                np.int32(weight) * padded[k + 1 - z, 1 - y : padded.shape[1] - y, 1 - x : padded.shape[2] - x]
+            )
         left[k] = voxels[k] - _predicted(sums)
     return left
 
@@ -56,13 +59,15 @@ def from_residuals(left: Bytes, weights: Sequence[int]) -> Bytes:
     so that those that take part are always neighbours in memory.
     """
     nz, ny, nx = left.shape
-    z, y = (a.ravel() for a in np.indices((nz, ny)))
+    z, y = (a.ravel() for a in np.indices((nz, ny), dtype=np.int32))
     order = np.argsort(z + y, kind="stable")
     z, y = z[order], y[order]
     start, rows = z + y, len(order)
     at = (z * ny + y) * nx - start
-    place = np.full((nz + 1, ny + 1), rows)  # the last row is of zeros, and stands beside the volume
-    place[z + 1, y + 1] = np.arange(rows)
+    place = np.full(
+        (nz + 1, ny + 1), rows, np.int32
+    )  # the last row is of zeros, and stands beside the volume
+    place[z + 1, y + 1] = np.arange(rows, dtype=np.int32)
     beside = {(a, b): place[z + 1 - a, y + 1 - b] for a, b in ((0, 1), (1, 0), (1, 1))}
     voxels, source = np.empty(left.size, np.uint8), left.ravel()
     recent = np.zeros((4, rows + 1), np.int32)  # voxels of this and of the last three sums, by row
@@ -79,15 +84,20 @@ def from_residuals(left: Bytes, weights: Sequence[int]) -> Bytes:
 
 
 def _predicted(sums: NDArray[np.int32]) -> Bytes:
-    return np.clip((sums + 128) >> 8, 0, 255).astype(np.uint8)
+    held: Bytes = np.clip((sums + 128) >> 8, 0, 255).astype(np.uint8)
+    return held
 
 
 def kept(mirrors: Mirrors) -> NDArray[np.bool_]:
     """Return which entries of a table are written, flat: those of which no mirror has an image earlier in it."""
-    return np.logical_and.reduce([_images(*mirror)[0] >= np.arange(_size(mirror)) for mirror in mirrors])
+    own = np.arange(_size(mirrors[0]))
+    written = np.ones(len(own), dtype=bool)
+    for mirror in mirrors:
+        written &= _images(*mirror)[0] >= own
+    return written
 
 
-def from_kept(values: NDArray[np.floating], mirrors: Mirrors) -> NDArray[np.floating]:
+def from_kept(values: NDArray[Any], mirrors: Mirrors) -> NDArray[Any]:
     """Return the table, flat, whose entries `kept` are values: the others are earlier ones, by the first mirror that says so."""
     own = np.arange(_size(mirrors[0]))
     source, sign = own.copy(), np.ones(len(own), np.int8)

@@ -166,11 +166,17 @@ class ArrayPart(Part):
 
     @model_validator(mode="after")
     def _checked(self) -> ArrayPart:
-        if isinstance(self.coding, NeighboursPart) and (self.dtype != "uint8" or len(self.shape) != 3):
-            raise ValueError(f"neighbours code uint8 of three axes; got {self.dtype} of {self.shape}")
+        if isinstance(self.coding, NeighboursPart):
+            fit = self.dtype == "uint8" and len(self.shape) == 3 and all(1 <= n <= 4096 for n in self.shape)
+            if not fit:
+                raise ValueError(
+                    f"neighbours code uint8 of three axes up to 4096; got {self.dtype} of {self.shape}"
+                )
         if isinstance(self.coding, MirroredPart):
             if not self.dtype.startswith("float") or prod(self.shape) > MOST_MIRRORED:
-                raise ValueError(f"mirrors code up to {MOST_MIRRORED} floats; got {self.dtype} of {self.shape}")
+                raise ValueError(
+                    f"mirrors code up to {MOST_MIRRORED} floats; got {self.dtype} of {self.shape}"
+                )
             rows, columns = self.coding.pairs[0]
             for sides in self.coding.pairs:
                 fit = len(sides[0]) * len(sides[1]) == prod(self.shape) and len(sides[0]) == len(rows)
@@ -183,7 +189,9 @@ class ArrayPart(Part):
     @property
     def count(self) -> int:
         """Numbers that are written."""
-        return int(kept(self.coding.pairs).sum()) if isinstance(self.coding, MirroredPart) else prod(self.shape)
+        return (
+            int(kept(self.coding.pairs).sum()) if isinstance(self.coding, MirroredPart) else prod(self.shape)
+        )
 
     def written(self, array: NDArray[Any]) -> NDArray[Any]:
         """Return what is written of an array.
@@ -388,9 +396,7 @@ def table(
     parts, at = {}, 0
     for name, array in arrays.items():
         kind: Any = array.dtype.name
-        part = ArrayPart(
-            dtype=kind, shape=list(array.shape), offset=at, coding=(codings or {}).get(name)
-        )
+        part = ArrayPart(dtype=kind, shape=list(array.shape), offset=at, coding=(codings or {}).get(name))
         parts[name] = part
         size = part.count * array.dtype.itemsize
         at += size + -size % 8

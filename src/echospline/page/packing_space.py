@@ -169,7 +169,8 @@ def _mirrors(core: SpatialForcedScene) -> list[MirrorPart]:
         middle = np.where(np.arange(3) == axis, low + high, 0.0)
         of_sources = _partners(sources * turned + middle, sources)
         of_points = _partners(
-            np.column_stack([points * turned + middle, 1e6 * opposite]), np.column_stack([points, 1e6 * faces])
+            np.column_stack([points * turned + middle, 1e6 * opposite]),
+            np.column_stack([points, 1e6 * faces]),
         )
         if of_sources is None or of_points is None:
             continue

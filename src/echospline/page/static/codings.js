@@ -11,7 +11,7 @@ const MOST_MIRRORED = 2 ** 24; // entries
 export function codingOf(entry, what, dtype, shape) {
   const size = shape.reduce((a, b) => a * b, 1), given = asRecord(entry, what);
   if (given.kind === "neighbours") {
-    if (dtype !== "uint8" || shape.length !== 3) throw new PackError(`Neighbours code bytes of three axes; ${what} is of ${shown(dtype)} of ${shown(shape)}. Make the page anew.`);
+    if (dtype !== "uint8" || shape.length !== 3 || shape.some((n) => n < 1 || n > 4096)) throw new PackError(`Neighbours code bytes of three axes up to 4096; ${what} is of ${shown(dtype)} of ${shown(shape)}. Make the page anew.`);
     const weights = asList(given.weights, `${what}.weights`, 7, 7).map((w) => asWhole(w, `${what}.weights`, -LARGEST_WEIGHT, LARGEST_WEIGHT));
     return { count: size, read: (left) => fromResiduals(left, shape, weights) };
   }
@@ -22,8 +22,8 @@ export function codingOf(entry, what, dtype, shape) {
   if (mirrors.some((m) => m.rows.length !== rows.length || m.columns.length * rows.length !== size)) {
     throw new PackError(`Rows and columns of the mirrors of ${what} fit no table of ${size} numbers. Make the page anew.`);
   }
-  const from = sources(mirrors, rows.length, columns.length);
-  return { count: from.reduce((n, at) => n + Number(at === 0), 0), read: (values) => fromKept(values, from) };
+  const { from, count } = sources(mirrors, rows.length, columns.length);
+  return { count, read: (values) => fromKept(values, from) };
 }
 
 /** @param {any} value @param {string} what */
@@ -49,7 +49,9 @@ function fromResiduals(left, [nz, ny, nx], [wx, wy, wxy, wz, wxz, wyz, wxyz]) {
       let a = 0, b = 0, c = 0, d = 0; // the four at x - 1
       for (let x = 0, at = (z * ny + y) * nx; x < nx; ++x, ++at) {
         const up = above[x], back = behind[x], both = corner[x];
-        const guess = (wx * a + wy * up + wxy * b + wz * back + wxz * c + wyz * both + wxyz * d + 128) >> 8;
+        // what the last voxel has no part in comes first: only the rest waits for it
+        const sum = (Math.imul(wy, up) + Math.imul(wxy, b) + Math.imul(wz, back) + Math.imul(wxz, c) + Math.imul(wyz, both) + Math.imul(wxyz, d) + 128) | 0;
+        const guess = (sum + Math.imul(wx, a)) >> 8;
         own[x] = a = (left[at] + (guess < 0 ? 0 : guess > 255 ? 255 : guess)) & 255;
         b = up;
         c = back;
@@ -60,20 +62,22 @@ function fromResiduals(left, [nz, ny, nx], [wx, wy, wxy, wz, wxz, wyz, wxyz]) {
   return voxels;
 }
 
-/** For every entry 0 where it was written, else the place of its earlier image, from 1, negative where the sign changes. @param {{ rows: Int32Array, columns: Int32Array }[]} mirrors @param {number} height @param {number} width */
+/** How many entries were written, and for every entry 0 where it was written, else the place of its earlier image, from 1, negative where the sign changes. @param {{ rows: Int32Array, columns: Int32Array }[]} mirrors @param {number} height @param {number} width */
 function sources(mirrors, height, width) {
   const from = new Int32Array(height * width);
+  let count = from.length;
   for (let r = 0, at = 0; r < height; ++r) {
     for (let c = 0; c < width; ++c, ++at) {
       for (const { rows, columns } of mirrors) {
         const row = rows[r], column = columns[c], image = (Math.abs(row) - 1) * width + Math.abs(column);
         if (image > at) continue;
         from[at] = row < 0 === column < 0 ? image : -image;
+        --count;
         break;
       }
     }
   }
-  return from;
+  return { from, count };
 }
 
 /** @param {Float32Array | Float64Array} values @param {Int32Array} from */
