@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from echospline.page import Exercise, Pack, packed
+from echospline.page.pack import table
 from echospline.scenario import Scenario
 from echospline.scene import Insertion, RegularGrid, UltrasoundImage
 
@@ -79,3 +80,9 @@ def session(pack: Pack, rows: np.ndarray, model: str = "tps", **more: Any) -> di
         "score": None,
     }  # fmt: skip
     return {**plain, **more}
+
+
+def uncoded(pack: Pack) -> Pack:
+    """The same scene, all of whose arrays are written plainly."""
+    arrays = dict(pack.arrays)
+    return Pack(pack.manifest.model_copy(update={"arrays": table(arrays)}), arrays)

@@ -154,7 +154,7 @@ def run(pack):
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_tables_with_wild_numbers_end_in_a_step_or_a_sentence(pack, dimension):
     """The core reads tables of strangers: indices, sizes and places that make no sense crash nothing."""
-    whole = page_scene.small(**{"model.kind": "green"}) if dimension == 2 else pack
+    whole = page_scene.small(**{"model.kind": "green"}) if dimension == 2 else page_scene.uncoded(pack)
     assert run(whole) == ""
     model = whole.manifest.models[0]
     assert model.kind == "forced"

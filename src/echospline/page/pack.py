@@ -1,7 +1,7 @@
 """The pack: one scene as bytes, with everything that a page needs to simulate it, by a reader and a writer that check it.
 
 Eight bytes `ECHOPACK`, the length of the manifest (uint32, little-endian), the manifest (JSON, UTF-8), zeros up to a multiple of eight, then the
-arrays, each at a multiple of eight from where they begin. The manifest is `Manifest` below, with a table of the arrays.
+arrays, each at a multiple of eight from where they begin. The manifest is `Manifest` below, with a table of the arrays; an array may be coded.
 """
 
 from __future__ import annotations
@@ -18,9 +18,10 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from echospline.errors import InputError
+from echospline.page.codings import LARGEST_WEIGHT, from_kept, from_residuals, kept, residuals
 from echospline.page.exercise import Exercise, check_exercises
 from echospline.scene import RegularGrid
 
@@ -32,6 +33,8 @@ LARGEST = 256 * 2**20
 """Bytes of a pack; a page's memory ends not far beyond."""
 MOST_NODES = 1_000_000
 """Of a mesh."""
+MOST_MIRRORED = 2**24
+"""Entries of an array whose mirror images are left out."""
 UNIT = 1e-6
 """Distance of a direction's length from 1 that rounding explains."""
 
@@ -115,17 +118,105 @@ class NeedlePart(Part):
     echo: Values
 
 
+class NeighboursPart(Part):
+    """Coding of a volume (nz, ny, nx) of bytes: each is what is left, modulo 256, of its prediction from the voxels before it.
+
+    The prediction is (sum of weight times voxel + 128) >> 8, held to 0 to 255; voxels beside the volume are 0. The weights are of
+    x-1; y-1; x-1 y-1; z-1; x-1 z-1; y-1 z-1; x-1 y-1 z-1.
+    """
+
+    kind: Literal["neighbours"] = "neighbours"
+    weights: list[Annotated[int, Field(ge=-LARGEST_WEIGHT, le=LARGEST_WEIGHT)]] = Field(
+        min_length=7, max_length=7
+    )
+
+
+Image = Annotated[int, Field(ge=-MOST_MIRRORED, le=MOST_MIRRORED)]
+
+
+class MirrorPart(Part):
+    """A mirror of a table: where the image of every row and column is, from 1, negative where its sign changes."""
+
+    rows: list[Image] = Field(min_length=1)
+    columns: list[Image] = Field(min_length=1)
+
+
+class MirroredPart(Part):
+    """Coding of a table: an entry is left out where a mirror has its image earlier; it is then that image, by the first mirror that has."""
+
+    kind: Literal["mirrored"] = "mirrored"
+    mirrors: list[MirrorPart] = Field(min_length=1, max_length=3)
+
+    @property
+    def pairs(self) -> list[tuple[list[int], list[int]]]:
+        """Rows and columns of every mirror."""
+        return [(mirror.rows, mirror.columns) for mirror in self.mirrors]
+
+
+Coding = Annotated[NeighboursPart | MirroredPart, Field(discriminator="kind")]
+
+
 class ArrayPart(Part):
-    """Where an array lies."""
+    """Where an array lies, and how it is written there; plainly without a coding."""
 
     dtype: Literal["uint8", "float32", "float64", "int32", "int64"]
     shape: list[Annotated[int, Field(ge=0, le=LARGEST)]] = Field(min_length=1, max_length=4)
     offset: int = Field(ge=0, le=LARGEST, multiple_of=8)
+    coding: Coding | None = None
+
+    @model_validator(mode="after")
+    def _checked(self) -> ArrayPart:
+        if isinstance(self.coding, NeighboursPart):
+            fit = self.dtype == "uint8" and len(self.shape) == 3 and all(1 <= n <= 4096 for n in self.shape)
+            if not fit:
+                raise ValueError(
+                    f"neighbours code uint8 of three axes up to 4096; got {self.dtype} of {self.shape}"
+                )
+        if isinstance(self.coding, MirroredPart):
+            if not self.dtype.startswith("float") or prod(self.shape) > MOST_MIRRORED:
+                raise ValueError(
+                    f"mirrors code up to {MOST_MIRRORED} floats; got {self.dtype} of {self.shape}"
+                )
+            rows, columns = self.coding.pairs[0]
+            for sides in self.coding.pairs:
+                fit = len(sides[0]) * len(sides[1]) == prod(self.shape) and len(sides[0]) == len(rows)
+                if not fit or any(not 1 <= abs(k) <= len(side) for side in sides for k in side):
+                    raise ValueError(
+                        f"rows and columns of a mirror lie in the table of {prod(self.shape)} numbers, {len(rows)} x {len(columns)}"
+                    )
+        return self
 
     @property
-    def bytes(self) -> int:
-        """Length in bytes."""
-        return prod(self.shape) * np.dtype(self.dtype).itemsize
+    def count(self) -> int:
+        """Numbers that are written."""
+        return (
+            int(kept(self.coding.pairs).sum()) if isinstance(self.coding, MirroredPart) else prod(self.shape)
+        )
+
+    def written(self, array: NDArray[Any]) -> NDArray[Any]:
+        """Return what is written of an array.
+
+        Raises
+        ------
+        InputError
+            If it is not as its coding says.
+        """
+        if isinstance(self.coding, NeighboursPart):
+            return residuals(array, self.coding.weights)
+        if isinstance(self.coding, MirroredPart):
+            left = array.ravel()[kept(self.coding.pairs)]
+            if from_kept(left, self.coding.pairs).tobytes() != array.tobytes():
+                raise InputError("an array of a pack is coded by mirrors, and its images differ from it")
+            return left
+        return array
+
+    def read(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return the array of which ``values`` were written."""
+        if isinstance(self.coding, NeighboursPart):
+            return from_residuals(values.reshape(self.shape), self.coding.weights)
+        if isinstance(self.coding, MirroredPart):
+            values = from_kept(values, self.coding.pairs)
+        return values.reshape(self.shape)
 
 
 class Manifest(Part):
@@ -226,7 +317,7 @@ class Pack:
         start = len(out)
         for name, part in self.manifest.arrays.items():
             out += bytes(start + part.offset - len(out))
-            out += self.arrays[name].tobytes()
+            out += part.written(self.arrays[name]).tobytes()
         return bytes(out)
 
     @classmethod
@@ -257,24 +348,27 @@ class Pack:
         arrays = {}
         end = 0
         for name, part in manifest.arrays.items():
-            if part.offset < end or start + part.offset + part.bytes > len(data):
+            kind = np.dtype(part.dtype).newbyteorder("<")
+            count = part.count
+            size = count * kind.itemsize
+            if part.offset < end or start + part.offset + size > len(data):
                 raise InputError(
                     f"array {name!r} of this pack overlaps another or ends beyond the pack's {len(data)} bytes"
                 )
-            end = part.offset + part.bytes
-            flat = np.frombuffer(
-                data, np.dtype(part.dtype).newbyteorder("<"), prod(part.shape), start + part.offset
-            )
-            arrays[name] = flat.reshape(part.shape).astype(part.dtype)
+            end = part.offset + size
+            flat = np.frombuffer(data, kind, count, start + part.offset)
+            arrays[name] = part.read(flat.astype(part.dtype))
         if start + end != len(data):
             raise InputError(f"this pack has {len(data)} bytes, and its arrays end at {start + end}")
         return cls(manifest, arrays, hashlib.sha256(data).hexdigest())
 
 
 def deflated(data: bytes) -> bytes:
-    """Compress as a page inflates it (raw deflate)."""
-    packer = zlib.compressobj(9, zlib.DEFLATED, -15, 9)
-    return packer.compress(data) + packer.flush()
+    """Compress as a page inflates it (raw deflate), by the shorter of two ways: what is left of a speckled volume repeats nothing."""
+    packers = [
+        zlib.compressobj(9, zlib.DEFLATED, -15, 9, way) for way in (zlib.Z_DEFAULT_STRATEGY, zlib.Z_FILTERED)
+    ]
+    return min((packer.compress(data) + packer.flush() for packer in packers), key=len)
 
 
 def inflated(data: bytes, most: int = LARGEST) -> bytes:
@@ -295,13 +389,17 @@ def inflated(data: bytes, most: int = LARGEST) -> bytes:
     return out
 
 
-def table(arrays: Mapping[str, NDArray[Any]]) -> dict[str, ArrayPart]:
-    """Lay arrays out one after the other."""
+def table(
+    arrays: Mapping[str, NDArray[Any]], codings: Mapping[str, NeighboursPart | MirroredPart] | None = None
+) -> dict[str, ArrayPart]:
+    """Lay arrays out one after the other, some of them coded."""
     parts, at = {}, 0
     for name, array in arrays.items():
         kind: Any = array.dtype.name
-        parts[name] = ArrayPart(dtype=kind, shape=list(array.shape), offset=at)
-        at += array.nbytes + -array.nbytes % 8
+        part = ArrayPart(dtype=kind, shape=list(array.shape), offset=at, coding=(codings or {}).get(name))
+        parts[name] = part
+        size = part.count * array.dtype.itemsize
+        at += size + -size % 8
     return parts
 
 

@@ -9,13 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from echospline.errors import InputError
+from echospline.page.codings import from_kept, kept, weights_of
 from echospline.page.exercise import default_exercises_space
 from echospline.page.pack import (
     FORMAT,
     Manifest,
     MeshPart,
+    MirroredPart,
+    MirrorPart,
     ModelPart,
     NeedlePart,
+    NeighboursPart,
     Pack,
     ProbePart,
     VolumePart,
@@ -23,13 +27,15 @@ from echospline.page.pack import (
 )
 from echospline.page.packing import FASTEST, LABELS, LAG, SENTENCES
 from echospline.picture import NeedleEcho
-from echospline.scenario import CoreScene, SpatialScene, spatial_scene
+from echospline.scenario import CoreScene, SpatialForcedScene, SpatialScene, spatial_scene
 from echospline.scene import ImagingPlane, SpatialGrid
 
 NARROW = {"condition_faces": np.int32, "answers": np.float32}
-"""Types of tables in a pack: single precision moves the answer by 2e-6 mm in `sample:spine`, and halves the file."""
+"""Types of tables in a pack: single precision moves the tissue by 2e-5 mm at most in `sample:spine` and `sample:kidney`, and halves the file."""
 MOST_VOXELS = 40_000_000
 """Of a volume in a page."""
+ALIKE = 1e-9
+"""Part of the greatest answer by which mirror images may differ: rounding of how they were solved, far below single precision."""
 
 
 def packed_space(scene: SpatialScene, *, language: str = "en", rate: float = 120.0) -> Pack:
@@ -67,7 +73,10 @@ def packed_space(scene: SpatialScene, *, language: str = "en", rate: float = 120
     axis = axis / np.linalg.norm(axis)
     plane = space.probe.planes(insertion).at(float(insertion.times[0]))
     arrays: dict[str, NDArray[Any]] = {"voxels": np.ascontiguousarray(volume.voxels)}
-    models = _models(scene, grid, arrays)
+    codings: dict[str, NeighboursPart | MirroredPart] = {
+        "voxels": NeighboursPart(weights=weights_of(arrays["voxels"]))
+    }
+    models = _models(scene, grid, arrays, codings)
     echo = scenario.needle_echo() or NeedleEcho(shaft=False, tip=False, tail=False, shadow=False)
     columns, rows = shape.grid.shape
     values: dict[str, Any] = {
@@ -88,7 +97,7 @@ def packed_space(scene: SpatialScene, *, language: str = "en", rate: float = 120
             entry=[float(v) for v in pose.entry], direction=axis.tolist(), lag=LAG, fastest=FASTEST, echo=echo.named()
         ),
         "exercises": list(scenario.exercise) or list(default_exercises_space(*(c.tolist() for c in grid.corners))),
-        "arrays": table(arrays),
+        "arrays": table(arrays, codings),
     }  # fmt: skip
     return Pack(Manifest(**values), arrays)
 
@@ -101,8 +110,13 @@ def pose_of(plane: ImagingPlane) -> list[float]:
     return [*(float(v) for v in m[:3, 3]), float(yaw), pitch, float(roll)]
 
 
-def _models(scene: SpatialScene, grid: SpatialGrid, arrays: dict[str, NDArray[Any]]) -> list[ModelPart]:
-    """Pack the scenario's own model first, then those that this tissue can have too; their arrays are added to ``arrays``."""
+def _models(
+    scene: SpatialScene,
+    grid: SpatialGrid,
+    arrays: dict[str, NDArray[Any]],
+    codings: dict[str, NeighboursPart | MirroredPart],
+) -> list[ModelPart]:
+    """Pack the scenario's own model first, then those that this tissue can have too; their arrays are added to ``arrays``, with their codings."""
     scenario, parts = scene.scenario, []
     for kind in sorted(("green", "elastic"), key=lambda kind: kind != scenario.model.kind):
         try:
@@ -121,6 +135,10 @@ def _models(scene: SpatialScene, grid: SpatialGrid, arrays: dict[str, NDArray[An
         else:
             given = dict(core.arrays)
             more = {"kind": "forced", "options": dict(core.options), "response": dict(core.response)}
+            mirrors = _mirrors(core)
+            if mirrors:
+                given["answers"] = _symmetric(given["answers"], mirrors)
+                codings[f"{kind}.answers"] = MirroredPart(mirrors=mirrors)
         named = {}
         for role, array in given.items():
             if array is not None and array.size:
@@ -133,3 +151,58 @@ def _models(scene: SpatialScene, grid: SpatialGrid, arrays: dict[str, NDArray[An
             "regions and is too large for elastic: leave its regions out, or --tissue homogeneous"
         )
     return parts
+
+
+def _mirrors(core: SpatialForcedScene) -> list[MirrorPart]:
+    """Mirrors of a block's tables: along an axis where its sources, conditions and answers are their own images in its middle."""
+    response, arrays = core.response, core.arrays
+    low, high = np.array(response["low"]), np.array(response["high"])
+    sources, points = (arrays[role].reshape(-1, 3) for role in ("sources", "conditions"))
+    faces = arrays["condition_faces"].astype(np.int64)
+    answers = arrays["answers"].reshape(-1, points.size)
+    rigid = {0: [], 3: [0, 2, 4], 6: list(range(6))}[len(answers) - sources.size]
+    found = []
+    for axis in range(3):
+        near, far = 1 << 2 * axis, 2 << 2 * axis
+        opposite = np.where(faces == near, far, np.where(faces == far, near, faces))
+        turned = np.where(np.arange(3) == axis, -1.0, 1.0)
+        middle = np.where(np.arange(3) == axis, low + high, 0.0)
+        of_sources = _partners(sources * turned + middle, sources)
+        of_points = _partners(
+            np.column_stack([points * turned + middle, 1e6 * opposite]),
+            np.column_stack([points, 1e6 * faces]),
+        )
+        if of_sources is None or of_points is None:
+            continue
+        # shifts along the axis change their sign, and rotations about the others do
+        signs = [*np.tile(turned, len(sources)), *np.concatenate([turned, -turned])[rigid]]
+        places = [*(3 * of_sources[:, None] + np.arange(3)).ravel(), *(sources.size + np.arange(len(rigid)))]
+        rows = (np.array(signs) * (np.array(places) + 1)).astype(int)
+        columns = (turned * (3 * of_points[:, None] + np.arange(3) + 1)).ravel().astype(int)
+        if np.abs(_imaged(answers, rows, columns) - answers).max() <= ALIKE * np.abs(answers).max():
+            found.append(MirrorPart(rows=rows.tolist(), columns=columns.tolist()))
+    return found
+
+
+def _partners(images: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.int64] | None:
+    """Index of the point at every image; None where there is none, or two images share one."""
+    apart = np.linalg.norm(images[:, None] - points[None], axis=-1)
+    nearest = apart.argmin(axis=1)
+    fits = (apart.min(axis=1) < 1e-9).all() and len(np.unique(nearest)) == len(points)
+    return nearest if fits else None
+
+
+def _imaged(answers: NDArray[Any], rows: NDArray[Any], columns: NDArray[Any]) -> NDArray[Any]:
+    signs = np.sign(rows)[:, None] * np.sign(columns)
+    imaged: NDArray[Any] = signs * answers[np.ix_(np.abs(rows) - 1, np.abs(columns) - 1)]
+    return imaged
+
+
+def _symmetric(answers: NDArray[Any], mirrors: list[MirrorPart]) -> NDArray[Any]:
+    """Mean of answers and their images, in single precision, so that images are the same bits."""
+    pairs = MirroredPart(mirrors=mirrors).pairs
+    mean = answers.reshape(len(pairs[0][0]), -1)
+    for rows, columns in pairs:
+        mean = (mean + _imaged(mean, np.array(rows), np.array(columns))) / 2
+    flat = mean.ravel().astype(NARROW["answers"])
+    return from_kept(flat[kept(pairs)], pairs).reshape(answers.shape)

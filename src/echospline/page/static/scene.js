@@ -1,6 +1,7 @@
 // The scene that a page shows: a pack of bytes, read and checked. Nothing of it is believed before it has been looked at.
 
 import { PackError, asList, asNumber, asNumbers, asRecord, asText, asWhole, shown } from "./checked.js";
+import { codingOf } from "./codings.js";
 import { readProbe } from "./probe.js";
 
 /** @import { Probe } from "./probe.js" */
@@ -164,13 +165,15 @@ function arrayView(bytes, start, name, entry) {
   const type = ARRAY_TYPES[/** @type {keyof typeof ARRAY_TYPES} */ (entry.dtype)];
   if (!Object.hasOwn(ARRAY_TYPES, entry.dtype) || !type) throw new PackError(`The scene's array ${shown(name)} is of a type that a page does not read: ${shown(entry.dtype)}.`);
   const shape = asList(entry.shape, `array ${name}`, 0, 8).map((n) => asWhole(n, `array ${name}`, 0, 2 ** 31));
-  const count = shape.reduce((a, b) => a * b, 1), offset = asWhole(entry.offset, `array ${name}`, 0, 2 ** 31);
-  const size = count * type.BYTES_PER_ELEMENT;
+  const offset = asWhole(entry.offset, `array ${name}`, 0, 2 ** 31), coded = (entry.coding ?? null) !== null;
+  const coding = coded ? codingOf(entry.coding, `the coding of array ${name}`, entry.dtype, shape) : null;
+  const count = coding?.count ?? shape.reduce((a, b) => a * b, 1), size = count * type.BYTES_PER_ELEMENT;
   if (offset % 8 || start + offset + size > bytes.length) {
     throw new PackError(`The scene is cut short: its array ${shown(name)} ends at byte ${start + offset + size} of ${bytes.length}. Make the page anew.`);
   }
   const at = bytes.byteOffset + start + offset;
-  return at % type.BYTES_PER_ELEMENT === 0 ? new type(/** @type {ArrayBuffer} */ (bytes.buffer), at, count) : new type(bytes.slice(start + offset, start + offset + size).buffer, 0, count);
+  const values = at % type.BYTES_PER_ELEMENT === 0 ? new type(/** @type {ArrayBuffer} */ (bytes.buffer), at, count) : new type(bytes.slice(start + offset, start + offset + size).buffer, 0, count);
+  return coding ? coding.read(values) : values;
 }
 
 /** @param {Values} values @param {Function} type @param {number} count @param {string} what */
