@@ -30,7 +30,11 @@ class SpaceMeshSection(Section):
         Annotated[int, Field(ge=2, le=257)],
         Annotated[int, Field(ge=2, le=257)],
         Annotated[int, Field(ge=2, le=257)],
-    ] = Field((21, 17, 15), description="nodes along x, y and z, corner to corner over the volume")
+    ] = Field(
+        (21, 17, 15),
+        description="nodes along x, y and z, corner to corner over the volume",
+        json_schema_extra={"between": "x"},  # as the command line takes it
+    )
     clamped: list[Face] = Field(
         ["left", "right", "bottom", "front", "back"], description="faces held fast; top is the skin"
     )
