@@ -25,6 +25,7 @@ FLAGS = [
 ]  # fmt: skip
 SECONDS = 20_000  # ms, the patience of every wait; nothing here is a measurement of speed
 SIZES = {"desk": (1440, 900), "tablet": (1024, 768), "landscape": (844, 390), "portrait": (390, 844)}
+OTHERS = {"laptop": (1280, 860), "small": (360, 640)}
 SMALL_TARGET, TOUCH_TARGET = 24, 44  # CSS pixels, for a mouse and for a finger
 EVIL = '<img src=x onerror="window.broken=1"></script><script>window.broken=2</script>'
 
@@ -67,8 +68,8 @@ def opened(browser, file, request):
     contexts, faults, asked = [], [], []
 
     def make(size="desk", path=file, **more):
-        width, height = SIZES[size]
-        touch = size in {"landscape", "portrait"}
+        width, height = {**SIZES, **OTHERS}[size]
+        touch = size in {"landscape", "portrait", "small"}
         options = {
             "viewport": {"width": width, "height": height}, "has_touch": touch, "is_mobile": touch, "offline": True,
             "device_scale_factor": 2 if touch else 1, "color_scheme": "dark", **more,
@@ -166,6 +167,43 @@ def test_every_control_is_large_enough_and_has_a_name(opened, size):
         if least == TOUCH_TARGET:
             assert control["height"] >= least, control
             assert control["width"] >= least, control
+
+
+@pytest.mark.parametrize("server", [False, True])
+@pytest.mark.parametrize("language", ["en", "de"])
+@pytest.mark.parametrize("size", [*SIZES, "laptop", "small"])
+def test_every_tool_is_in_view_in_both_languages_with_a_server_too(opened, size, language, server):
+    page = ready(opened(size))
+    if language == "de":
+        page.locator('[data-do="language"]').click()
+        until(page, "document.documentElement.lang === 'de'")
+    if server:  # its buttons alone make the bar longer
+        page.evaluate(
+            "document.querySelectorAll('.tools [data-served]').forEach((button) => (button.hidden = false))"
+        )
+    names, hidden = page.evaluate(
+        """() => {
+          const bar = document.querySelector('.tools').getBoundingClientRect(), tools = [...document.querySelectorAll('.tools button')].filter((b) => b.checkVisibility());
+          const cut = tools.filter((button) => {
+            const box = button.getBoundingClientRect();
+            return box.left < bar.left || box.right > bar.right || box.top < bar.top || box.bottom > Math.min(bar.bottom, innerHeight) || button.scrollWidth > button.clientWidth;
+          });
+          return [tools.map((b) => b.dataset.do), cut.map((b) => b.dataset.do)];
+        }"""
+    )
+    assert len(names) == (11 if server else 9)
+    assert names[-1] == "reset"
+    assert hidden == []
+
+
+@pytest.mark.parametrize("size", ["desk", "laptop", "tablet", "landscape", "portrait"])
+def test_sliders_are_long_enough_to_set_a_degree(opened, volume_file, size):
+    page = ready(opened(size, volume_file))
+    widths = page.evaluate(
+        "[...document.querySelectorAll('.slider input')].filter((c) => c.checkVisibility()).map((c) => c.offsetWidth)"
+    )
+    assert len(widths) >= 5
+    assert min(widths) >= 90
 
 
 @pytest.mark.parametrize("size", ["desk", "portrait"])
