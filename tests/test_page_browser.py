@@ -357,6 +357,22 @@ def test_letters_do_what_the_buttons_do(opened, key, name):
     expect(button).to_have_attribute("aria-pressed", "true")
 
 
+def test_after_a_dialog_is_closed_with_the_mouse_the_keys_steer_and_space_resets(opened):
+    page = ready(opened())
+    page.locator("#start").click()
+    push(page, 4)
+    page.locator("#start").click()
+    page.locator("#summary [data-close]").click()
+    expect(page.locator("#stage")).to_be_focused()
+    page.keyboard.press(" ")
+    until(page, "Number(document.getElementById('stage').dataset.depth) < 0.01")
+    assert not page.evaluate("document.body.classList.contains('recording')"), "Space is not Start again"
+    page.locator('[data-do="help"]').focus()
+    page.keyboard.press("Enter")
+    page.keyboard.press("Escape")
+    expect(page.locator('[data-do="help"]')).to_be_focused()
+
+
 def test_frozen_time_stands_still(opened):
     page = ready(opened())
     push(page, 4)
@@ -372,8 +388,8 @@ def test_frozen_time_stands_still(opened):
 def test_a_reader_of_the_screen_hears_no_chatter_while_the_needle_moves(opened):
     page = ready(opened())
     page.evaluate(
-        """() => { window.said = []; for (const e of document.querySelectorAll('[role=status], [role=alert], [aria-live]'))
-          new MutationObserver(() => window.said.push(e.id)).observe(e, { childList: true, characterData: true, subtree: true }); }"""
+        """() => { window.said = []; for (const e of document.querySelectorAll('[role=status], [role=alert], [aria-live], output'))
+          if (e.ariaLive !== 'off') new MutationObserver(() => window.said.push(e.outerHTML)).observe(e, { childList: true, characterData: true, subtree: true }); }"""
     )
     push(page, 8)
     page.wait_for_timeout(700)
