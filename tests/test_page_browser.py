@@ -512,6 +512,46 @@ def test_an_examination_takes_every_help_away_until_it_ends(opened):
     assert page.locator('[data-help="rings"]').is_checked()
 
 
+@pytest.mark.parametrize("size", ["portrait", "landscape"])
+def test_dialogs_on_a_phone_begin_at_their_top_and_fingers_find_every_control(opened, size):
+    page = ready(opened(size))
+    page.locator("#trainee").fill("A name that is rather long")
+    train(page, "easy", to=4)
+    for dialog, leave in (
+        ("summary", "#summary [data-close]"),
+        ("attempts", "#attempts [data-close]"),
+        ("help", None),
+    ):
+        if dialog == "attempts":
+            page.locator('[data-do="sessions"]').click()
+        elif dialog == "help":
+            page.locator('header [data-do="help"]').click()
+        expect(page.locator(f"#{dialog} h2").first).to_be_in_viewport()
+        small = page.evaluate(
+            f"""[...document.querySelectorAll('#{dialog} button, #{dialog} select')].filter((c) => c.checkVisibility()).map((c) => {{
+              const box = c.getBoundingClientRect(); return [c.id || c.textContent, box.width, box.height]; }})"""
+        )
+        assert all(width >= TOUCH_TARGET and height >= TOUCH_TARGET for _, width, height in small), small
+        widths = page.evaluate(
+            f"[...document.querySelectorAll('#{dialog} select')].filter((c) => c.checkVisibility()).map((c) => c.offsetWidth)"
+        )
+        assert all(width >= 90 for width in widths), "what is chosen can be read"
+        if leave:
+            page.locator(leave).click()
+
+
+@pytest.mark.parametrize("size", ["portrait", "landscape"])
+def test_a_replay_on_a_phone_is_scrubbed_with_a_finger_and_has_no_buttons_for_the_needle(opened, size):
+    page = ready(opened(size))
+    train(page, "easy", to=4)
+    page.locator("#watch").click()
+    expect(page.locator("#player")).to_be_visible()
+    expect(page.locator(".pad")).to_be_hidden()
+    box = page.locator("#scrub").bounding_box()
+    assert box["height"] >= TOUCH_TARGET
+    assert box["width"] >= 100
+
+
 def test_a_replay_shows_what_was_done_with_pause_speed_and_scrubbing(opened):
     page = ready(opened())
     train(page, "easy", to=6)

@@ -88,7 +88,7 @@ const TABLE = {
   "class-check": ["Run again", "Nachgerechnet"], "class-verified": ["same numbers", "gleiche Zahlen"], "class-differs": ["does not count", "zählt nicht"], "class-benchmark": ["Benchmark", "Vorbild"], "class-benchmark-title": ["Show this attempt's level to the class", "Diesen Versuch der Klasse als Vorbild zeigen"],
   "class-csv": ["Sessions as CSV", "Versuche als CSV"], "class-curves-csv": ["Curves as CSV", "Kurven als CSV"], "class-again": ["Read anew", "Neu lesen"],
   // replay
-  "play": ["Play", "Abspielen"], "pause": ["Pause", "Anhalten"], "speed": ["Speed", "Tempo"], "scrub": ["Place in the replay", "Stelle der Wiedergabe"], "leave": ["End replay", "Wiedergabe beenden"],
+  "play": ["Play", "Abspielen"], "pause": ["Pause", "Anhalten"], "speed": ["Speed", "Tempo"], "scrub": ["Place in the replay", "Stelle der Wiedergabe"], "leave": ["End replay", "Beenden"],
   "event-entered": ["needle in", "Nadel ein"], "event-left": ["needle out", "Nadel aus"], "event-vessel": ["vessel touched", "Gefäß berührt"], "event-target": ["target reached", "Ziel erreicht"], "event-lost": ["tip lost from the picture", "Spitze aus dem Bild"], "event-redirection": ["redirection", "Richtungswechsel"],
   // help and notes
   "help-title": ["How to steer", "So steuerst du"],
