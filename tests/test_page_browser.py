@@ -203,7 +203,7 @@ def test_sliders_are_long_enough_to_set_a_degree(opened, volume_file, size):
         "[...document.querySelectorAll('.slider input')].filter((c) => c.checkVisibility()).map((c) => c.offsetWidth)"
     )
     assert len(widths) >= 5
-    assert min(widths) >= 90
+    assert min(widths) >= 80
 
 
 @pytest.mark.parametrize("size", ["desk", "portrait"])
