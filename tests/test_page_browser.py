@@ -512,6 +512,26 @@ def test_an_examination_takes_every_help_away_until_it_ends(opened):
     assert page.locator('[data-help="rings"]').is_checked()
 
 
+def test_a_file_of_attempts_that_is_read_twice_makes_no_second_attempts(opened, tmp_path):
+    page = ready(opened())
+    train(page, "easy", to=4)
+    page.locator("#summary [data-close]").click()
+    page.locator('[data-do="sessions"]').click()
+    with page.expect_download() as made:
+        page.locator("#export-all").click()
+    made.value.save_as(tmp_path / "attempts.json")
+    page.locator("#import-file").set_input_files(tmp_path / "attempts.json")
+    expect(page.locator("#attempts-said")).to_have_text("Attempts read: 0.")
+    assert page.locator("#session-rows tr").count() == 1
+    page.on("dialog", lambda asked: asked.accept())
+    page.locator("#erase").click()
+    expect(page.locator("#session-rows tr")).to_have_count(0)
+    for count in (1, 0):
+        page.locator("#import-file").set_input_files(tmp_path / "attempts.json")
+        expect(page.locator("#attempts-said")).to_have_text(f"Attempts read: {count}.")
+        assert page.locator("#session-rows tr").count() == 1
+
+
 @pytest.mark.parametrize("size", ["portrait", "landscape"])
 def test_dialogs_on_a_phone_begin_at_their_top_and_fingers_find_every_control(opened, size):
     page = ready(opened(size))

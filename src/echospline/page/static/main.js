@@ -283,7 +283,7 @@ function retraced(session) {
 /** Whether this scene can show a session; says why not. @param {Session} session */
 function playable(session) {
   const other = session.scene.pack !== named().pack ? say("other-scene") : state.models.includes(session.model) ? "" : say("no-model", { name: session.model });
-  put(byId("attempts-said"), other);
+  files.told(other, false);
   return !other;
 }
 
