@@ -140,7 +140,7 @@ def test_a_trainees_curve_is_lc_cusum_of_the_attempts_that_count(sessions):
 def test_tables_for_a_spreadsheet_hold_every_attempt_and_no_formula(sessions):
     table = list(csv.DictReader(io.StringIO(sessions_csv(sessions))))
     assert [row["verified"] for row in table] == ["", "", "", "", "no", "", "", "", ""]
-    assert table[4]["difference"] == "time is 4, the page said 3"
+    assert [row["difference"] for row in table if row["difference"]] == ["time is 4, the page said 3"]
     assert table[8]["trainee"] == "'=cmd"
     assert [row["attempt"] for row in table[:5]] == ["1", "1", "2", "2", "3"]
     curves = list(csv.DictReader(io.StringIO(curves_csv(class_answer(sessions, CLASS)))))

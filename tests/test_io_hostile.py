@@ -177,6 +177,13 @@ def test_what_is_no_file_is_named(tmp_path: Path) -> None:
             read(tmp_path / "pipe", spacing=(0.1, 0.1))
 
 
+def test_an_empty_file_gets_one_reason_and_one_advice(tmp_path: Path) -> None:
+    (tmp_path / "a.png").touch()
+    with pytest.raises(InputError) as caught:
+        read(tmp_path / "a.png", spacing=(0.1, 0.1))
+    assert str(caught.value) == f"{tmp_path / 'a.png'} is empty (0 bytes): copy or record it again"
+
+
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may read everything")
 def test_a_file_without_permission_is_named(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(SAMPLES["png"])

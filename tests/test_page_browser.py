@@ -25,6 +25,7 @@ FLAGS = [
 ]  # fmt: skip
 SECONDS = 20_000  # ms, the patience of every wait; nothing here is a measurement of speed
 SIZES = {"desk": (1440, 900), "tablet": (1024, 768), "landscape": (844, 390), "portrait": (390, 844)}
+OTHERS = {"laptop": (1280, 860), "small": (360, 640)}
 SMALL_TARGET, TOUCH_TARGET = 24, 44  # CSS pixels, for a mouse and for a finger
 EVIL = '<img src=x onerror="window.broken=1"></script><script>window.broken=2</script>'
 
@@ -67,8 +68,8 @@ def opened(browser, file, request):
     contexts, faults, asked = [], [], []
 
     def make(size="desk", path=file, **more):
-        width, height = SIZES[size]
-        touch = size in {"landscape", "portrait"}
+        width, height = {**SIZES, **OTHERS}[size]
+        touch = size in {"landscape", "portrait", "small"}
         options = {
             "viewport": {"width": width, "height": height}, "has_touch": touch, "is_mobile": touch, "offline": True,
             "device_scale_factor": 2 if touch else 1, "color_scheme": "dark", **more,
@@ -166,6 +167,44 @@ def test_every_control_is_large_enough_and_has_a_name(opened, size):
         if least == TOUCH_TARGET:
             assert control["height"] >= least, control
             assert control["width"] >= least, control
+
+
+@pytest.mark.parametrize("server", [False, True])
+@pytest.mark.parametrize("language", ["en", "de"])
+@pytest.mark.parametrize("size", [*SIZES, "laptop", "small"])
+def test_every_tool_is_in_view_in_both_languages_with_a_server_too(opened, size, language, server):
+    page = ready(opened(size))
+    if language == "de":
+        page.locator('[data-do="language"]').click()
+        until(page, "document.documentElement.lang === 'de'")
+    if server:  # its buttons alone make the bar longer
+        page.evaluate(
+            "document.querySelectorAll('header [data-served], .tools [data-served]').forEach((button) => (button.hidden = false))"
+        )
+    names, hidden = page.evaluate(
+        """() => {
+          const bar = document.querySelector('.tools').getBoundingClientRect(), tools = [...document.querySelectorAll('.tools button')].filter((b) => b.checkVisibility());
+          const cut = tools.filter((button) => {
+            const box = button.getBoundingClientRect();
+            return box.left < bar.left || box.right > bar.right || box.top < bar.top || box.bottom > Math.min(bar.bottom, innerHeight) || button.scrollWidth > button.clientWidth;
+          });
+          const wide = [...document.querySelectorAll('header button')].filter((b) => b.checkVisibility() && b.getBoundingClientRect().right > innerWidth);
+          return [tools.map((b) => b.dataset.do), [...cut, ...wide].map((b) => b.dataset.do)];
+        }"""
+    )
+    assert len(names) == (11 if server else 9)
+    assert names[-1] == "reset"
+    assert hidden == []
+
+
+@pytest.mark.parametrize("size", ["desk", "laptop", "tablet", "landscape", "portrait"])
+def test_sliders_are_long_enough_to_set_a_degree(opened, volume_file, size):
+    page = ready(opened(size, volume_file))
+    widths = page.evaluate(
+        "[...document.querySelectorAll('.slider input')].filter((c) => c.checkVisibility()).map((c) => c.offsetWidth)"
+    )
+    assert len(widths) >= 5
+    assert min(widths) >= 80
 
 
 @pytest.mark.parametrize("size", ["desk", "portrait"])
@@ -319,6 +358,22 @@ def test_letters_do_what_the_buttons_do(opened, key, name):
     expect(button).to_have_attribute("aria-pressed", "true")
 
 
+def test_after_a_dialog_is_closed_with_the_mouse_the_keys_steer_and_space_resets(opened):
+    page = ready(opened())
+    page.locator("#start").click()
+    push(page, 4)
+    page.locator("#start").click()
+    page.locator("#summary [data-close]").click()
+    expect(page.locator("#stage")).to_be_focused()
+    page.keyboard.press(" ")
+    until(page, "Number(document.getElementById('stage').dataset.depth) < 0.01")
+    assert not page.evaluate("document.body.classList.contains('recording')"), "Space is not Start again"
+    page.locator('[data-do="help"]').focus()
+    page.keyboard.press("Enter")
+    page.keyboard.press("Escape")
+    expect(page.locator('[data-do="help"]')).to_be_focused()
+
+
 def test_frozen_time_stands_still(opened):
     page = ready(opened())
     push(page, 4)
@@ -334,8 +389,8 @@ def test_frozen_time_stands_still(opened):
 def test_a_reader_of_the_screen_hears_no_chatter_while_the_needle_moves(opened):
     page = ready(opened())
     page.evaluate(
-        """() => { window.said = []; for (const e of document.querySelectorAll('[role=status], [role=alert], [aria-live]'))
-          new MutationObserver(() => window.said.push(e.id)).observe(e, { childList: true, characterData: true, subtree: true }); }"""
+        """() => { window.said = []; for (const e of document.querySelectorAll('[role=status], [role=alert], [aria-live], output'))
+          if (e.ariaLive !== 'off') new MutationObserver(() => window.said.push(e.outerHTML)).observe(e, { childList: true, characterData: true, subtree: true }); }"""
     )
     push(page, 8)
     page.wait_for_timeout(700)
@@ -456,6 +511,66 @@ def test_an_examination_takes_every_help_away_until_it_ends(opened):
     page.keyboard.press(" ")
     until(page, "!document.body.classList.contains('recording')")
     assert page.locator('[data-help="rings"]').is_checked()
+
+
+def test_a_file_of_attempts_that_is_read_twice_makes_no_second_attempts(opened, tmp_path):
+    page = ready(opened())
+    train(page, "easy", to=4)
+    page.locator("#summary [data-close]").click()
+    page.locator('[data-do="sessions"]').click()
+    with page.expect_download() as made:
+        page.locator("#export-all").click()
+    made.value.save_as(tmp_path / "attempts.json")
+    page.locator("#import-file").set_input_files(tmp_path / "attempts.json")
+    expect(page.locator("#attempts-said")).to_have_text("Attempts read: 0.")
+    assert page.locator("#session-rows tr").count() == 1
+    page.on("dialog", lambda asked: asked.accept())
+    page.locator("#erase").click()
+    expect(page.locator("#session-rows tr")).to_have_count(0)
+    for count in (1, 0):
+        page.locator("#import-file").set_input_files(tmp_path / "attempts.json")
+        expect(page.locator("#attempts-said")).to_have_text(f"Attempts read: {count}.")
+        assert page.locator("#session-rows tr").count() == 1
+
+
+@pytest.mark.parametrize("size", ["portrait", "landscape"])
+def test_dialogs_on_a_phone_begin_at_their_top_and_fingers_find_every_control(opened, size):
+    page = ready(opened(size))
+    page.locator("#trainee").fill("A name that is rather long")
+    train(page, "easy", to=4)
+    for dialog, leave in (
+        ("summary", "#summary [data-close]"),
+        ("attempts", "#attempts [data-close]"),
+        ("help", None),
+    ):
+        if dialog == "attempts":
+            page.locator('[data-do="sessions"]').click()
+        elif dialog == "help":
+            page.locator('header [data-do="help"]').click()
+        expect(page.locator(f"#{dialog} h2").first).to_be_in_viewport()
+        small = page.evaluate(
+            f"""[...document.querySelectorAll('#{dialog} button, #{dialog} select')].filter((c) => c.checkVisibility()).map((c) => {{
+              const box = c.getBoundingClientRect(); return [c.id || c.textContent, box.width, box.height]; }})"""
+        )
+        assert all(width >= TOUCH_TARGET and height >= TOUCH_TARGET for _, width, height in small), small
+        widths = page.evaluate(
+            f"[...document.querySelectorAll('#{dialog} select')].filter((c) => c.checkVisibility()).map((c) => c.offsetWidth)"
+        )
+        assert all(width >= 90 for width in widths), "what is chosen can be read"
+        if leave:
+            page.locator(leave).click()
+
+
+@pytest.mark.parametrize("size", ["portrait", "landscape"])
+def test_a_replay_on_a_phone_is_scrubbed_with_a_finger_and_has_no_buttons_for_the_needle(opened, size):
+    page = ready(opened(size))
+    train(page, "easy", to=4)
+    page.locator("#watch").click()
+    expect(page.locator("#player")).to_be_visible()
+    expect(page.locator(".pad")).to_be_hidden()
+    box = page.locator("#scrub").bounding_box()
+    assert box["height"] >= TOUCH_TARGET
+    assert box["width"] >= 100
 
 
 def test_a_replay_shows_what_was_done_with_pause_speed_and_scrubbing(opened):

@@ -7,6 +7,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import numpy as np
+import pydicom
 import pytest
 from PIL import Image
 from playwright.sync_api import expect
@@ -130,11 +131,17 @@ def test_a_file_is_opened_by_the_server_and_one_that_is_none_is_said(server, vis
 
 def test_the_last_seconds_become_a_dicom_file(server, visit, tmp_path):
     page = visit(server[0])
+    push(page, 4)
+    page.wait_for_timeout(1500)
     push(page, 8)
     with page.expect_download() as made:
         page.locator('[data-do="dicom"]').click()
     made.value.save_as(tmp_path / "x.dcm")
-    assert (tmp_path / "x.dcm").read_bytes()[128:132] == b"DICM"
+    file = pydicom.dcmread(tmp_path / "x.dcm")
+    assert 1000 / 15.5 < file.FrameTime < 1000 / 14.5, "pictures are held where nothing moved, at one pace"
+    assert file.NumberOfFrames == len(file.pixel_array) > 15
+    (region,) = file.SequenceOfUltrasoundRegions
+    assert (10 * region.PhysicalDeltaX, 10 * region.PhysicalDeltaY) == pytest.approx(image().grid.spacing)
 
 
 def test_a_tracker_steers_the_needle_and_its_trouble_is_said(server, visit):

@@ -94,6 +94,8 @@ test("calipers measure, are limited in number, and too short ones are dropped", 
 });
 
 test("a caliper is set by the keys as by the pointer", () => {
+  const first = after(freshState(), { do: "tool", name: "caliper" }, { do: "mark" }, { do: "cursor", by: [3, 4] }, { do: "mark" }).calipers[0];
+  assert.ok(Math.abs(Math.hypot(first.b[0] - first.a[0], first.b[1] - first.a[1]) - 5) < 1e-9, "Enter before any arrow marks the middle");
   const state = after(freshState(), { do: "tool", name: "caliper" }, { do: "cursor", at: [5, 5] }, { do: "mark" }, { do: "cursor", by: [3, 4] }, { do: "mark" });
   assert.deepEqual(state.calipers, [{ a: [5, 5], b: [8, 9] }]);
 });

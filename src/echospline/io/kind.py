@@ -66,6 +66,8 @@ def head(path: Path) -> bytes:
             raise InputError(f"{path} is empty (0 bytes): copy or record it again")
         with path.open("rb") as file:
             return file.read(HEAD)
+    except InputError:
+        raise
     except FileNotFoundError:
         raise InputError(f"there is no file {path}: check the name (now in folder {os.getcwd()})") from None
     except (OSError, ValueError) as error:

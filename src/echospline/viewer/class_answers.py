@@ -236,4 +236,4 @@ def _with_unit(name: str) -> str:
 
 def _plain(text: str) -> str:
     """Quote text that a spreadsheet would read as a formula."""
-    return f"'{text}" if text[:1] in "=+-@\t\r" else text
+    return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text

@@ -7,6 +7,7 @@ import { Renderer } from "./renderer.js";
 
 const SECONDS = 8, RATE = 15; // of a clip, s and frames/s
 const MOST_BYTES = 64 << 20; // of memory for it
+const MOST_SENT = (64 << 20) - 4096; // bytes of pictures that a server takes, with room for the words before them
 const TYPES = ["video/webm;codecs=vp9", "video/webm;codecs=vp8", "video/webm", "video/mp4"];
 
 /** The last seconds of what was drawn, grey pictures and lists of what lay over them, in memory of fixed size. */
@@ -32,6 +33,23 @@ export class Reel {
   /** What lay over the picture that was just kept. @param {number} now ms @param {DrawCommand[]} list */
   over(now, list) {
     if (this.last === now) this.frames[this.frames.length - 1].list = list;
+  }
+
+  /**
+   * What was kept at an even pace, as files need it that know no other: where nothing moved the last picture is held.
+   * @returns {{ frames: Frame[], rate: number }} frames of one size and how many of them a second lasts
+   */
+  even() {
+    const { columns, rows } = this.frames[0], same = this.frames.filter((frame) => frame.columns === columns && frame.rows === rows);
+    const first = same[0].at, seconds = (same[same.length - 1].at - first) / 1000;
+    const count = Math.max(1, Math.min(Math.round(seconds * RATE) + 1, Math.floor(MOST_SENT / (columns * rows)))), rate = count > 1 ? (count - 1) / seconds : RATE;
+    let k = 0;
+    const frames = Array.from({ length: count }, (_, n) => {
+      const at = first + ((n + 0.5) * 1000) / rate; // a picture that is nearly due is shown: the screen's pace is never quite even
+      while (k + 1 < same.length && same[k + 1].at <= at) ++k;
+      return same[k];
+    });
+    return { frames, rate };
   }
 
   /** Seconds that a clip would last. */

@@ -55,13 +55,14 @@ export function drawChart(canvas, chart, theme) {
   for (const { label: name, colour, x, y, dots } of chart.lines) {
     line(x.map((value, k) => [px(value), py(y[k])]), colour, 2);
     c.fillStyle = colour;
-    if (dots) {
+    if (dots || x.length === 1) {
       x.forEach((value, k) => {
         c.beginPath();
         c.arc(px(value), py(y[k]), 3.5, 0, 2 * Math.PI);
         c.fill();
       });
     }
+    if (!name) continue;
     label(c, name, legend, 9, colour, "right");
     legend -= c.measureText(name).width + 16;
   }

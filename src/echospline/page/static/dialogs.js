@@ -18,7 +18,10 @@ const METRICS = /** @type {[keyof Score, string][]} */ ([
 /** Open a dialog that is not open. @param {string} id */
 export function openDialog(id) {
   const dialog = /** @type {HTMLDialogElement} */ (byId(id));
-  if (!dialog.open) dialog.showModal();
+  if (!dialog.open) {
+    dialog.showModal();
+    dialog.scrollTop = 0; // the button that has the focus can be below what a phone shows
+  }
   return dialog;
 }
 

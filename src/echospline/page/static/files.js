@@ -47,13 +47,20 @@ export class Files {
   /** @param {File} file */
   async imported(file) {
     try {
-      const read = readSessions(await file.text());
-      await this.page.store.add(read);
+      const { store } = this.page, had = new Set(store.sessions.map(identity)), read = readSessions(await file.text());
+      const fresh = read.filter((session) => !had.has(identity(session)) && had.add(identity(session))); // a file that is read twice makes no second attempts
+      await store.add(fresh);
       this.page.listed();
-      put(byId("attempts-said"), this.page.say("imported", { count: read.length }));
+      this.told(this.page.say("imported", { count: fresh.length }), true);
     } catch (error) {
-      put(byId("attempts-said"), messageOf(error));
+      this.told(messageOf(error), false);
     }
+  }
+
+  /** Say in the dialog of attempts how reading went. @param {string} text @param {boolean} well */
+  told(text, well) {
+    byId("attempts-said").classList.toggle("well", well);
+    put(byId("attempts-said"), text);
   }
 
   /** @param {Blob} blob @param {string} name */
@@ -61,6 +68,11 @@ export class Files {
     download(blob, name);
     this.page.notice(this.page.say("saved", { name }));
   }
+}
+
+/** What makes two attempts the same one. @param {Session} session */
+function identity({ started, trainee, exercise, scene, model, poses }) {
+  return JSON.stringify([started, trainee, exercise.name, scene.pack, model, poses]);
 }
 
 /** An error as a sentence. @param {unknown} error */

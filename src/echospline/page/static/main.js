@@ -283,7 +283,7 @@ function retraced(session) {
 /** Whether this scene can show a session; says why not. @param {Session} session */
 function playable(session) {
   const other = session.scene.pack !== named().pack ? say("other-scene") : state.models.includes(session.model) ? "" : say("no-model", { name: session.model });
-  put(byId("attempts-said"), other);
+  files.told(other, false);
   return !other;
 }
 
@@ -438,6 +438,11 @@ function wire() {
     const target = /** @type {HTMLElement} */ (event.target), control = target.closest("button, summary, input[type=range], input[type=checkbox], input[type=radio]");
     if (event.detail > 0 && control && !control.closest("dialog") && !document.querySelector("dialog[open]")) byId("stage").focus({ preventScroll: true });
   });
+  // A dialog gives the focus back to its button; who closes it with the pointer steers on, and Space is Reset again.
+  let pointed = false;
+  document.addEventListener("click", (event) => (pointed = event.detail > 0), true);
+  document.addEventListener("keydown", () => (pointed = false), true);
+  for (const dialog of document.querySelectorAll("dialog")) dialog.addEventListener("close", () => pointed && !document.querySelector("dialog[open]") && byId("stage").focus({ preventScroll: true }));
   setInterval(() => panels.spoken(state, live), 500);
   if (matchMedia("(max-width: 640px)").matches) for (const panel of document.querySelectorAll("details.panel:not(#probe-panel)")) /** @type {HTMLDetailsElement} */ (panel).open = false;
 }

@@ -53,7 +53,7 @@ export class Panels {
     this.sliders = [0, 0, 0, 0, 0, 0].map((_, k) => {
       const range = /** @type {HTMLInputElement} */ (element("input", { type: "range", min: "-20", max: "20", step: "1", value: "0" }));
       range.addEventListener("input", () => act({ do: "timeGain", k, dB: Number(range.value) }));
-      const row = element("label", {}, element("span", {}), range, element("output", {}));
+      const row = element("label", {}, element("span", {}), range, element("output", { ariaLive: "off" }));
       byId("time-gains").append(row);
       return { range, row };
     });

@@ -161,12 +161,12 @@ export class Served {
   }
 
   async dicom() {
-    const { frames, seconds } = this.page.reel, { pack } = this.page.engine();
-    if (frames.length < 2) return this.page.notice(this.page.say("clip-none"));
-    const { columns, rows } = frames[0], of = pack.probe ?? pack.image, same = frames.filter((frame) => frame.columns === columns && frame.rows === rows);
-    const head = { columns, rows, frames: same.length, samples: 1, spacing: of ? [of.spacing[0], of.spacing[1]] : null, title: pack.title.slice(0, 200) };
+    const { reel } = this.page, { pack } = this.page.engine();
+    if (reel.seconds === 0) return this.page.notice(this.page.say("clip-none"));
+    const { frames, rate } = reel.even(), { columns, rows } = frames[0], of = pack.probe ?? pack.image;
+    const head = { columns, rows, frames: frames.length, samples: 1, spacing: of ? [of.spacing[0], of.spacing[1]] : null, title: pack.title.slice(0, 200) };
     try {
-      this.page.saved(await this.server.dicom(head, same.map((frame) => frame.colours), Math.max(1, (frames.length - 1) / seconds)), "echospline.dcm");
+      this.page.saved(await this.server.dicom(head, frames.map((frame) => frame.colours), rate), "echospline.dcm");
     } catch (error) {
       this.page.notice(this.words(error));
     }

@@ -242,8 +242,9 @@ const CHANGES = {
   tool: (s, { name }) => ({ ...s, tool: s.tool === name ? "needle" : name, drawing: null, cursor: null }),
   cursor: (s, { at, by }) => cursorMoved(s, at, by),
   mark: (s) => {
-    if (s.tool !== "caliper" || !s.cursor) return s;
-    return s.drawing ? { ...CHANGES.measured(s, { do: "measured" }), cursor: s.cursor } : { ...s, drawing: { a: s.cursor, b: s.cursor } };
+    if (s.tool !== "caliper") return s;
+    if (!s.cursor) s = cursorMoved(s); // Enter before any arrow marks the middle
+    return s.drawing ? { ...CHANGES.measured(s, { do: "measured" }), cursor: s.cursor } : { ...s, drawing: { a: /** @type {Point} */ (s.cursor), b: /** @type {Point} */ (s.cursor) } };
   },
   measure: (s, { a, b }) => ({ ...s, drawing: { a, b } }),
   measured: (s) => {

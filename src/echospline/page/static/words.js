@@ -50,7 +50,7 @@ const TABLE = {
   "stopped": ["The model stopped: {reason} Reset starts it again.", "Das Modell hielt an: {reason} Zurück startet es neu."],
   "clip-works": ["The last {seconds} seconds are drawn again and saved...", "Die letzten {seconds} Sekunden werden nochmals gezeichnet und gespeichert..."],
   "clip-none": ["Nothing has moved yet.", "Noch hat sich nichts bewegt."], "clip-refused": ["This browser records no video: {reason}", "Dieser Browser nimmt keinen Film auf: {reason}"],
-  "saved": ["Saved {name}.", "{name} gespeichert."], "imported": ["{count} attempts read.", "{count} Versuche gelesen."], "other-scene": ["This attempt was made with another scene.", "Dieser Versuch entstand mit einer anderen Szene."],
+  "saved": ["Saved {name}.", "{name} gespeichert."], "imported": ["Attempts read: {count}.", "Gelesene Versuche: {count}."], "other-scene": ["This attempt was made with another scene.", "Dieser Versuch entstand mit einer anderen Szene."],
   "no-model": ["This scene has no model {name}.", "Diese Szene hat kein Modell {name}."],
   // server
   "server-lost": ["The server is lost: this page goes on, and attempts are kept here.", "Der Server ist weg: Diese Seite läuft weiter, Versuche bleiben hier."], "tracker": ["Tracker: {text}", "Tracker: {text}"],
@@ -68,7 +68,7 @@ const TABLE = {
   "why-out": ["the needle was not in the tissue at the end", "die Nadel war am Ende nicht im Gewebe"],
   "why-far": ["the tip ended {error} mm from the target's centre (its radius is {radius} mm)", "die Spitze endete {error} mm von der Mitte des Ziels (sein Radius ist {radius} mm)"],
   "why-hit": ["the tip ended {error} mm from the target's centre", "die Spitze endete {error} mm von der Mitte des Ziels"],
-  "why-vessel": ["a vessel was touched {count} times", "ein Gefäß wurde {count}-mal berührt"],
+  "why-vessel": ["contacts with vessels: {count}", "Kontakte mit Gefäßen: {count}"],
   "why-turns": ["{count} redirections, {most} allowed", "{count} Richtungswechsel, {most} erlaubt"],
   "final_error": ["Tip to target", "Spitze zum Ziel"], "target_shift": ["Target moved by the tissue", "Ziel vom Gewebe bewegt"], "time": ["Time", "Zeit"], "picture_time": ["Tip in the picture", "Spitze im Bild"], "tissue_time": ["Time in tissue", "Zeit im Gewebe"], "path_length": ["Path length", "Weglänge"],
   "path_inefficiency": ["Path inefficiency", "Umweg"], "tissue_damage": ["Tissue damage (area swept)", "Gewebeschaden (überstrichene Fläche)"], "punctures": ["Punctures", "Einstiche"],
@@ -88,7 +88,7 @@ const TABLE = {
   "class-check": ["Run again", "Nachgerechnet"], "class-verified": ["same numbers", "gleiche Zahlen"], "class-differs": ["does not count", "zählt nicht"], "class-benchmark": ["Benchmark", "Vorbild"], "class-benchmark-title": ["Show this attempt's level to the class", "Diesen Versuch der Klasse als Vorbild zeigen"],
   "class-csv": ["Sessions as CSV", "Versuche als CSV"], "class-curves-csv": ["Curves as CSV", "Kurven als CSV"], "class-again": ["Read anew", "Neu lesen"],
   // replay
-  "play": ["Play", "Abspielen"], "pause": ["Pause", "Anhalten"], "speed": ["Speed", "Tempo"], "scrub": ["Place in the replay", "Stelle der Wiedergabe"], "leave": ["End replay", "Wiedergabe beenden"],
+  "play": ["Play", "Abspielen"], "pause": ["Pause", "Anhalten"], "speed": ["Speed", "Tempo"], "scrub": ["Place in the replay", "Stelle der Wiedergabe"], "leave": ["End replay", "Beenden"],
   "event-entered": ["needle in", "Nadel ein"], "event-left": ["needle out", "Nadel aus"], "event-vessel": ["vessel touched", "Gefäß berührt"], "event-target": ["target reached", "Ziel erreicht"], "event-lost": ["tip lost from the picture", "Spitze aus dem Bild"], "event-redirection": ["redirection", "Richtungswechsel"],
   // help and notes
   "help-title": ["How to steer", "So steuerst du"],
