@@ -96,7 +96,7 @@ def kind_of(path: Path) -> tuple[Kind, str]:
     if found:
         return found
     stranger = next((name for magic, name in _STRANGERS.items() if start.startswith(magic)), None)
-    what = f"is {stranger}" if stranger else f"begins with {start[:8]!r}, which no known format does"
+    what = f"is {stranger}" if stranger else f"begins with {str(start[:8])[1:]}, which no known format does"
     raise InputError(f"{path} {what}; expected {READABLE}")
 
 
