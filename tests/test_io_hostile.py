@@ -148,7 +148,7 @@ def test_a_wrong_suffix_changes_nothing_or_is_named(tmp_path: Path, kind: str) -
         (b"", "is empty"),
         (b"\x89PNG\r\n\x1a\n", "damaged or cut short"),
         (b"%PDF-1.7 ...", "is a PDF document"),
-        (b"hello, this is no picture", "begins with b'hello, t'"),
+        (b"hello, this is no picture", "begins with 'hello, t'"),
         (b"MATLAB 5.0 MAT-file", "Matlab"),
         (b"\x1f\x8b\x08\x00junk", "which no known format does"),
     ],

@@ -33,7 +33,9 @@ HANDS = [
 def opened(kind: str = "green", shape: str = "linear") -> SpatialScene:
     values = {
         "model.kind": kind,
-        "space.mesh.nodes": (9, 9, 9) if kind == "green" else (19, 19, 19),  # landmarks: within delta of needles
+        "space.mesh.nodes": (9, 9, 9)
+        if kind == "green"
+        else (19, 19, 19),  # landmarks: within delta of needles
         "space.probe.shape": shape,
         "space.probe.width": 24.0,
         "space.probe.radius": 30.0,
