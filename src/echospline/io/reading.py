@@ -151,7 +151,11 @@ def choose_image(
     chosen = 0 if frame is None else _checked_frame(recording, frame)
     if frame is None and recording.frames > 1:
         if recording.volume:
-            raise _is_volume(recording, "give --frame, the number of a slice from 0")
+            raise _is_volume(
+                recording,
+                "give --frame, the number of a slice from 0, or take the whole as a scene in space "
+                "where the command has --view (--view longitudinal, --depth-axis y)",
+            )
         chosen = int(_kept(recording)[0])
         if chosen:
             notes = (*notes, f"frame {chosen} taken, the first good one")

@@ -293,7 +293,7 @@ def _report(
     per_frame = []
     observed = seen.displacement if observed is None else observed
     for t, u, v in zip(seen.times, found.field, observed, strict=True):
-        moves = (np.hypot(*np.nan_to_num(v).T) > 0).any()
+        moves = (np.hypot(*np.nan_to_num(v).T) > MOVED).any()
         per_frame.append({"time_s": float(t), "mae_mm": field_error(u, v).mae if moves else None})
     return {
         "source": path.name,
