@@ -241,7 +241,9 @@ def _in_space(scenario: scenario_room.Scenario, changes: dict[str, Any]) -> dict
     named = source is not None and scenario_room.is_spatial(scenario.with_values({"image.file": source}))
     if not (named or scenario_room.is_spatial(scenario) or any(key.startswith("space.") for key in changes)):
         return changes
-    return {(f"space.{k}" if k in [f"needle.{name}" for name in _SHARED] else k): v for k, v in changes.items()}
+    return {
+        (f"space.{k}" if k in [f"needle.{name}" for name in _SHARED] else k): v for k, v in changes.items()
+    }
 
 
 def _flat(values: dict[str, Any]) -> dict[str, Any]:

@@ -158,7 +158,7 @@ class Cost:
     def __str__(self) -> str:
         """Return the cost as words."""
         return (
-            f"{self.frames:,} frames, about {said_bytes(self.bytes)} on the disk and {_timed(self.seconds)} on a machine like the one of "
+            f"{self.frames:,} frames, about {said_bytes(self.bytes)} on the disk and {said_time(self.seconds)} on a machine like the one of "
             "docs/performance.md"
         )
 
@@ -313,10 +313,12 @@ def _length(mm: float) -> str:
 
 
 def said_bytes(count: float) -> str:
+    """Say a number of bytes in words."""
     return f"{count / GIB:,.1f} GiB" if count >= GIB / 10 else f"{count / 2**20:,.1f} MiB"
 
 
-def _timed(seconds: float) -> str:
+def said_time(seconds: float) -> str:
+    """Say a time in words."""
     if seconds < 120:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:,.0f} h"

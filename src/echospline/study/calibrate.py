@@ -17,7 +17,7 @@ from echospline.io import read_needle
 from echospline.mechanics import FEMModel, GreenModel, TPSModel
 from echospline.scenario import MODELS, Scenario, build_model, is_spatial, load, open_spatial
 from echospline.scenario.space_section import SpaceSection
-from echospline.scene import Floats, field_error
+from echospline.scene import MOVED, Floats, field_error
 from echospline.study.charts import error_map
 from echospline.study.identify import Identification, Objective, grid_search, identify
 from echospline.study.spatial_fit import PictureRuns, SeenRun, fit_in_space
