@@ -29,7 +29,7 @@ def simulate(
         str,
         typer.Argument(
             metavar="IMAGE_OR_SCENARIO",
-            help="an image, cine or DICOM file, sample:calf, or a scenario (.toml)",
+            help="an image, cine or DICOM file, a volume with an option of space (--view), sample:calf, sample:kidney, sample:spine, or a scenario (.toml)",
         ),
     ],
     out: Out = Path("out"),
