@@ -1,6 +1,7 @@
 """Identification in space: what a picture shows of a run gives back the parameters of the run."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +16,9 @@ from echospline.picture.slices import lattice_of
 from echospline.scenario import load, open_spatial
 from echospline.scenario.space_models import build_spatial_model
 from echospline.scene import Volume
+from echospline.study.calibrate import _report
 from echospline.study.spatial_fit import PictureRuns, SeenRun, fit_in_space
+from echospline.study.unit_fields import Observation
 
 TRUE = {"tip": 0.2, "friction_limit": 0.02}
 SCENE = """
@@ -142,6 +145,19 @@ def test_identify_takes_a_run_in_space_and_writes_a_scenario_that_repeats_it(sce
     )
     difference = np.linalg.norm(first.displacement - second.displacement, axis=2)
     assert difference.max() < 0.03 * np.linalg.norm(first.displacement, axis=2).max()
+
+
+@pytest.mark.parametrize("rounding", [0.0, 1e-14])
+def test_a_moment_at_which_nothing_moves_but_by_rounding_has_no_error(opened, frames, rounding):
+    chosen = [0, 4, 8]
+    observed = runs(opened, frames, chosen)
+    found = fit_in_space(observed, "mae", bootstrap=0)
+    seen = observed.seen.displacement - observed.still()
+    seen[0] = rounding
+    motion = Observation(observed.seen.points, seen, observed.seen.times[chosen], [None] * 3)
+    told = _report("green", "mae", Path("run.npz"), motion, found)["per_frame"]
+    assert told[0]["mae_mm"] is None
+    assert told[-1]["mae_mm"] < 2e-4
 
 
 def test_the_methods_of_the_plane_are_refused(scene):

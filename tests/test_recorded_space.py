@@ -381,7 +381,6 @@ def test_a_calibration_with_more_skew_than_a_fit_leaves_is_refused(recording, tm
         (["--face", "left"], "--face expects two numbers A,B; got 'left'"),
         (["--place", "moon"], "--place is one of axial, file, lps; got 'moon'"),
         (["--reference", "Patient"], "a chain of transforms must lead from Image to Patient"),
-        (["--formats", "igs.mha"], "output.formats = igs.mha is not written in space yet"),
     ],
 )  # fmt: skip
 def test_what_a_replay_cannot_use_gets_one_sentence(recording, tmp_path, words, sentence):

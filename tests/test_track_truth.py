@@ -7,6 +7,7 @@ import sys
 import weakref
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from scipy.io import loadmat, savemat
 from scipy.ndimage import gaussian_filter, shift
 from typer.testing import CliRunner
 
+from echospline import tracking
 from echospline.cli.app import app
 from echospline.cli.info import describe
 from echospline.errors import EchosplineError, InputError, MissingExtraError
@@ -394,3 +396,12 @@ def test_damaged_arrays_give_one_sentence_or_lines(tmp_path: Path, kind: str, da
     except EchosplineError as error:
         said = str(error)
     assert "\n" not in said
+
+
+@pytest.mark.parametrize(("lasts", "said"), [(2.0, False), (2.2, False), (4.0, True), (1.0, True)])
+def test_a_truth_that_lasts_another_time_than_the_cine_is_doubted(lasts: float, said: bool) -> None:
+    times = np.linspace(0.0, 2.0, 11)
+    found = tracking.Track(np.zeros((1, 2)), times, np.zeros((11, 1, 2)), np.ones((11, 1)), (0,))
+    motion = SimpleNamespace(times=np.linspace(5.0, 5.0 + lasts, 7))
+    doubts = tracking.truth_doubts(found, SimpleNamespace(motion=motion))
+    assert [f"lasts {lasts:g} s and the cine 2 s" in doubt for doubt in doubts] == [True] * said

@@ -8,11 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import SimpleITK
+from scipy.spatial.transform import Rotation
 
 from echospline.errors import InputError
-from echospline.io.volume_reading import read_volume
+from echospline.io import read_image
+from echospline.io.samples import IN_SPACE
+from echospline.io.volume_reading import along_frame, read_volume, read_volume_and_axis
 from echospline.io.volume_writing import write_volume
 from echospline.laboratory import sample_volume
+from echospline.laboratory.sample_volumes import SAMPLE_VOLUMES
 from echospline.scene import Volume
 
 RNG = np.random.default_rng(4)
@@ -169,3 +173,61 @@ def test_sample_spine_is_the_phantom_with_its_skin_up() -> None:
     filled = volume.voxels > 0
     above, below = (volume.voxels[:, rows][filled[:, rows]].mean() for rows in (slice(8, 30), slice(60, 90)))
     assert above > 10 * below
+
+
+def test_a_volume_at_any_slant_is_turned_by_the_smallest_turn_and_never_mirrored() -> None:
+    turns = Rotation.random(300, random_state=1).as_matrix()
+    turns = np.concatenate([turns, turns[:100] * [1.0, 1.0, -1.0]])  # files whose own axes are left-handed
+    rotations = Rotation.create_group("O").as_matrix()
+    for direction in turns:
+        signed = np.zeros((3, 3))
+        for axis in range(3):
+            mark = np.zeros((3, 3, 3))
+            mark[tuple(2 if 2 - k == axis else 1 for k in range(3))] = (
+                1.0  # one voxel along this axis of the file
+            )
+            told = along_frame(Volume(mark, (1.0, 1.0, 1.0)), direction)
+            signed[:, axis] = np.argwhere(told.voxels == 1.0)[0][::-1] - 1
+        hand = np.linalg.det(direction)
+        assert np.linalg.det(signed) == pytest.approx(hand)
+        mirror = np.diag([1.0, 1.0, 1.0 if hand > 0 else -1.0])
+        nearest = max(np.trace((turn @ mirror).T @ direction) for turn in rotations)
+        assert np.trace(signed.T @ direction) == pytest.approx(nearest)
+
+
+@pytest.mark.parametrize("depth", ["x", "-x", "y", "-y", "z", "-z"])
+@pytest.mark.parametrize("code", ["LPS", "RAS", "SPL", "AIR"])
+def test_the_axis_of_the_file_that_is_named_is_the_one_along_which_depth_runs(
+    tmp_path: Path, code: str, depth: str
+) -> None:
+    turned = SimpleITK.DICOMOrient(SimpleITK.GetImageFromArray(VOXELS), code)
+    path = tmp_path / "a.nii.gz"
+    SimpleITK.WriteImage(turned, str(path))
+    volume, said = read_volume_and_axis(path, depth)
+    of_file = SimpleITK.GetArrayFromImage(SimpleITK.ReadImage(str(path)))
+    axis, _, backwards = said.partition(", ")
+    along = np.moveaxis(of_file, {"the first": 2, "the second": 1, "the third": 0}[axis], 0)
+    along = along[::-1] if backwards else along
+    for k in range(len(along)):
+        np.testing.assert_array_equal(np.sort(volume.voxels[:, k].ravel()), np.sort(along[k].ravel()))
+
+
+def test_a_tracked_sweep_is_no_volume_until_it_is_reconstructed(tmp_path: Path) -> None:
+    path = tmp_path / "sweep.mha"
+    fields = "".join(f"Seq_Frame{k:04d}_Timestamp = {0.1 * k}\n" for k in range(5))
+    header = (
+        "ObjectType = Image\nNDims = 3\nDimSize = 7 6 5\nElementSpacing = 1 1 1\nElementType = MET_UCHAR\n"
+        f"Kinds = domain domain list\n{fields}ElementDataFile = LOCAL\n"
+    )
+    path.write_bytes(header.encode() + VOXELS.tobytes())
+    with pytest.raises(InputError, match=r"is a cine.*`echospline reconstruct`"):
+        read_volume(path)
+
+
+def test_a_sample_that_is_a_volume_is_named_where_a_picture_is_expected() -> None:
+    assert set(IN_SPACE) == set(SAMPLE_VOLUMES)
+    for name in IN_SPACE:
+        with pytest.raises(InputError, match="is a volume; expected a picture: sample:calf"):
+            read_image(f"sample:{name}")
+        with pytest.raises(InputError, match=name):
+            read_image("sample:kidny")

@@ -53,15 +53,16 @@ def of_sample_volume(name: str) -> dict[str, Any]:
 
 def of_file_volume(path: Path, limit: float) -> dict[str, Any]:
     """Describe a file whose third axis is a direction in space, or say why it cannot be simulated."""
-    from echospline.io.volume_reading import read_volume
+    from echospline.io.volume_reading import read_volume_and_axis
 
     try:
-        volume = read_volume(path, limit=limit)
+        volume, axis = read_volume_and_axis(path, limit=limit)
     except InputError as error:
         return {"notes": [f"no volume for a scene in space: {error}"]}
     return of_volume(volume) | {
         "notes": [
-            "`echospline simulate` takes it as a scene in space; depth along the second axis unless --depth-axis says another"
+            f"`echospline simulate --view longitudinal` takes it as a scene in space; depth along y of its frame, {axis} of its file, unless "
+            "--depth-axis says another"
         ]
     }
 

@@ -218,14 +218,32 @@ def scenario_from(source: str, changes: dict[str, Any]) -> tuple[scenario_room.S
     else:
         scenario, folder = scenario_room.Scenario(), Path.cwd()
         changes = {"image.file": source, **changes}
+    changes = _in_space(scenario, changes)
     try:
         return scenario.with_values(_flat({k: _read(k, v) for k, v in changes.items()}), "options"), folder
     except InputError as error:  # the message names the user's flag, not the key
-        flag = next(
-            (o.flag for o in OPTIONS if str(error).startswith(f"options: {o.key}") and o.key in changes), None
-        )
-        key = next((o.key for o in OPTIONS if o.flag == flag), "")
-        raise InputError(str(error).replace(f"options: {key}", str(flag)) if flag else str(error)) from None
+        said = str(error)
+        for key in sorted(changes, key=len, reverse=True):
+            flags = {o.key: o.flag for o in OPTIONS}
+            flag = flags.get(key, flags.get(key.removeprefix("space.")))
+            if flag and said.startswith(f"options: {key}"):
+                raise InputError(said.replace(f"options: {key}", flag)) from None
+        raise InputError(said) from None
+
+
+_SHARED = ("speed", "dwell", "retract", "retract_speed")
+"""Keys of [needle] whose option means the same in space, for [space.needle]."""
+
+
+def _in_space(scenario: scenario_room.Scenario, changes: dict[str, Any]) -> dict[str, Any]:
+    """Give the options of how a needle moves to [space.needle] where the scene is one in space."""
+    source = changes.get("image.file")
+    named = source is not None and scenario_room.is_spatial(scenario.with_values({"image.file": source}))
+    if not (named or scenario_room.is_spatial(scenario) or any(key.startswith("space.") for key in changes)):
+        return changes
+    return {
+        (f"space.{k}" if k in [f"needle.{name}" for name in _SHARED] else k): v for k, v in changes.items()
+    }
 
 
 def _flat(values: dict[str, Any]) -> dict[str, Any]:

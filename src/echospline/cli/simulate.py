@@ -29,7 +29,7 @@ def simulate(
         str,
         typer.Argument(
             metavar="IMAGE_OR_SCENARIO",
-            help="an image, cine or DICOM file, sample:calf, or a scenario (.toml)",
+            help="an image, cine or DICOM file, a volume with an option of space (--view), sample:calf, sample:kidney, sample:spine, or a scenario (.toml)",
         ),
     ],
     out: Out = Path("out"),
@@ -109,6 +109,8 @@ def _simulate_space(scenario: scenario_room.Scenario, folder: Path, out: Path, *
 
     opened = scenario_room.open_spatial(scenario, folder)
     say(opened.notes, "note")
+    doubts = scenario_room.check_space(opened.scenario, opened.volume, out)
+    say(doubts)
     space = opened.scenario.space
     assert space is not None
     model = build_spatial_model(opened.scenario, space.grid(opened.volume), opened.tissue)
@@ -125,8 +127,9 @@ def _simulate_space(scenario: scenario_room.Scenario, folder: Path, out: Path, *
             folder,
             progress=lambda done, count: bar.update(task, completed=done, total=count),
             form_image=opened.form_image,
+            doubts=doubts,
         )
-    say(report["doubts"])
+    say(doubt for doubt in report["doubts"] if doubt not in doubts)
     if as_json:
         json.dump(report, sys.stdout, indent=2)
         print()

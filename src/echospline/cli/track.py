@@ -197,6 +197,7 @@ def track(
     tracking.write_track(out, found, poses)
     report = summary(found, perf_counter() - began)
     if known is not None:
+        say(tracking.truth_doubts(found, known))
         report["against_truth"] = {
             k: round(v, 4) if isfinite(v) else None for k, v in asdict(tracking.score(found, known)).items()
         }

@@ -14,7 +14,7 @@ from echospline.errors import InputError
 from echospline.io.declared import aspect_note
 from echospline.io.kind import READABLE, kind_of
 from echospline.io.recording import LIMIT, MIB, Box, Recording, check_size, to_grey
-from echospline.io.samples import SAMPLES, sample_image
+from echospline.io.samples import IN_SPACE, SAMPLES, sample_image
 from echospline.scene import Cine, Floats, Pixels, RegularGrid, UltrasoundImage
 
 SAMPLE = "sample:"
@@ -146,12 +146,16 @@ def choose_image(
     if str(path).startswith(SAMPLE):
         return _sample(str(path).removeprefix(SAMPLE), spacing, region), 0, None
     recording = open_recording(path, limit, whole=False)
+    if frame is None and recording.frames > 1 and recording.volume:
+        raise _is_volume(
+            recording,
+            "give --frame, the number of a slice from 0, or take the whole as a scene in space "
+            "where the command has --view (--view longitudinal, --depth-axis y)",
+        )
     box = _checked_box(recording, region)
     grid, notes = _grid(recording, box, spacing)
     chosen = 0 if frame is None else _checked_frame(recording, frame)
     if frame is None and recording.frames > 1:
-        if recording.volume:
-            raise _is_volume(recording, "give --frame, the number of a slice from 0")
         chosen = int(_kept(recording)[0])
         if chosen:
             notes = (*notes, f"frame {chosen} taken, the first good one")
@@ -243,7 +247,11 @@ def open_recording(path: str | Path, limit: float = LIMIT, *, whole: bool = True
 
 def _sample(name: str, spacing: Sequence[float] | None, region: Sequence[int] | None) -> UltrasoundImage:
     if name not in SAMPLES:
-        raise InputError(f"there is no sample {name!r}; expected one of: {', '.join(SAMPLES)}")
+        if name in IN_SPACE:
+            raise InputError(f"{SAMPLE}{name} is a volume; expected a picture: {SAMPLE}{', '.join(SAMPLES)}")
+        raise InputError(
+            f"there is no sample {name!r}; expected one of: {', '.join(SAMPLES)}, or in space {', '.join(IN_SPACE)}"
+        )
     image = sample_image(name)
     if spacing is not None or region is not None:
         raise InputError(f"{SAMPLE}{name} has a spacing and a region of its own: give neither")

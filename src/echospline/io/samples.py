@@ -40,6 +40,9 @@ SAMPLES = {
     )
 }
 
+IN_SPACE = ("kidney", "spine")
+"""Samples that are volumes, which the laboratory makes or reads: here they are only named."""
+
 
 def sample_image(name: str = "calf") -> UltrasoundImage:
     """Return a shipped image with its spacing.

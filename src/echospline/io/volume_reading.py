@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import permutations, product
 from math import degrees, isfinite
 from pathlib import Path
 from typing import Any
@@ -46,13 +47,23 @@ def read_volume(path: str | Path, depth: str = "y", *, limit: float = LIMIT) -> 
     InputError
         If the file is damaged, too large, in colour or no volume, or a voxel is not a finite number.
     """
+    return read_volume_and_axis(path, depth, limit=limit)[0]
+
+
+def read_volume_and_axis(path: str | Path, depth: str = "y", *, limit: float = LIMIT) -> tuple[Volume, str]:
+    """Read a volume as `read_volume` does, and say in words along which axis of its file depth runs: "the second, backwards"."""
     path = Path(path)
     kind, format = kind_of(path)
     if kind == "dicom":
-        return _of_dicom(path, limit).with_depth(depth)
+        volume, direction = _of_dicom(path, limit)
+        return along_frame(volume, direction).with_depth(depth), _axis_of_file(direction, depth)
     if kind not in ("metaimage", "nrrd", "nifti"):
         raise InputError(f"{path} is {format}; a volume is read from MetaImage, NRRD, NIfTI or DICOM")
     recording = open_volume(path, kind, format, limit, whole=True)
+    if not recording.volume and recording.frames > 1:
+        raise InputError(
+            f"{path} is a cine, whose third axis is time; expected a volume: of a tracked sweep `echospline reconstruct` makes one"
+        )
     _check(path, recording)
     with decoding(path, format):
         reader = _ITK.ImageFileReader()
@@ -66,11 +77,12 @@ def read_volume(path: str | Path, depth: str = "y", *, limit: float = LIMIT) -> 
     _check_finite(path, voxels)
     spacing = _spacing(path, recording.spacing, lengths, turned=any("turned" in n for n in recording.notes))
     volume = Volume(voxels, spacing, source=path.name)
-    return along_frame(volume, flat.reshape(3, 3)).with_depth(depth)
+    direction = flat.reshape(3, 3)
+    return along_frame(volume, direction).with_depth(depth), _axis_of_file(direction, depth)
 
 
-def _of_dicom(path: Path, limit: float) -> Volume:
-    """Read the slices of an enhanced DICOM file, along its frame of reference."""
+def _of_dicom(path: Path, limit: float) -> tuple[Volume, Floats]:
+    """Read the slices of an enhanced DICOM file, and the directions of its axes in its frame of reference."""
     # pydicom takes longer to load than every other reader together: only for its files
     from echospline.io.dicom import open_dicom_volume, slices  # noqa: PLC0415
 
@@ -78,7 +90,7 @@ def _of_dicom(path: Path, limit: float) -> Volume:
     _check(path, recording)
     voxels = np.stack(list(slices(recording, order)))
     _check_finite(path, voxels)
-    return along_frame(Volume(voxels, spacing, source=path.name), direction)
+    return Volume(voxels, spacing, source=path.name), direction
 
 
 def _check(path: Path, recording: Recording) -> None:
@@ -116,19 +128,47 @@ def _spacing(
 
 
 def along_frame(volume: Volume, direction: Floats) -> Volume:
-    """Swap and reverse axes so that each lies along the nearest one of the frame that directions (3, 3) refer to."""
+    """Swap and reverse axes so that each lies along the nearest one of the frame that directions (3, 3) refer to.
+
+    What was right-handed stays so: however far the volume is slanted, it is turned and never mirrored.
+    """
     if not np.isfinite(direction).all():
         raise InputError(f"{volume.source} has directions that are not finite numbers: {direction.tolist()}")
-    axes = np.argmax(np.abs(direction), axis=0)  # for x, y and z of the file: which axis of the frame
-    if sorted(axes) != [0, 1, 2]:
-        axes = np.arange(3)
-    order = np.argsort(axes)  # for each axis of the frame: which of the file
-    signs = np.array([direction[k, order[k]] for k in range(3)])
-    voxels = volume.voxels.transpose([2 - int(a) for a in order[::-1]])
+    order, signs = _nearest_axes(direction)
+    along = np.array([sign * direction[k, order[k]] for k, sign in enumerate(signs)])
+    voxels = volume.voxels.transpose([2 - a for a in order[::-1]])
     voxels = voxels[tuple(slice(None, None, -1 if s < 0 else 1) for s in signs[::-1])]
-    x, y, z = (volume.spacing[int(a)] for a in order)
-    slant = degrees(float(np.arccos(np.clip(np.abs(signs).min(), -1.0, 1.0))))
+    x, y, z = (volume.spacing[a] for a in order)
+    slant = degrees(float(np.arccos(np.clip(along.min(), -1.0, 1.0))))
     told = f" (slanted by {slant:.1f} degrees to its frame)" if slant > 0.1 else ""
     return replace(
         volume, voxels=np.ascontiguousarray(voxels), spacing=(x, y, z), source=volume.source + told
+    )
+
+
+def _axis_of_file(direction: Floats, depth: str) -> str:
+    """Return in words which axis of the file depth runs along."""
+    order, signs = _nearest_axes(direction)
+    k = "xyz".index(depth[-1])
+    forwards = (signs[k] > 0) != depth.startswith("-")
+    return ("the first", "the second", "the third")[order[k]] + ("" if forwards else ", backwards")
+
+
+def _nearest_axes(direction: Floats) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Return, for x, y and z of the frame, which axis of the file lies along it and whether forwards (1) or backwards (-1).
+
+    Of the 24 ways with the hand of ``direction`` it is that of the smallest turn; the first of them where several are as small.
+    """
+    hand = -1 if np.linalg.det(direction) < 0 else 1
+    ways = [
+        (order, signs)
+        for order in permutations(range(3))
+        for signs in product((1, -1), repeat=3)
+        if np.linalg.det(np.eye(3)[list(order)] * signs) * hand > 0
+    ]
+    return max(
+        ways,
+        key=lambda way: round(
+            float(sum(s * direction[k, a] for k, (a, s) in enumerate(zip(*way, strict=True)))), 9
+        ),
     )

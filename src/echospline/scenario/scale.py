@@ -158,7 +158,7 @@ class Cost:
     def __str__(self) -> str:
         """Return the cost as words."""
         return (
-            f"{self.frames:,} frames, about {_sized(self.bytes)} on the disk and {_timed(self.seconds)} on a machine like the one of "
+            f"{self.frames:,} frames, about {said_bytes(self.bytes)} on the disk and {said_time(self.seconds)} on a machine like the one of "
             "docs/performance.md"
         )
 
@@ -230,11 +230,11 @@ def check(scenario: Scenario, image: UltrasoundImage, out: Path | None = None) -
     if cost.memory > memory:
         raise InputError(
             f"{scenario.model.kind} on mesh.nodes = {list(scenario.mesh.nodes)} and a picture of {list(image.grid.shape)} pixels needs "
-            f"about {_sized(cost.memory)} of memory; this machine has {_sized(memory)}: choose a coarser mesh"
+            f"about {said_bytes(cost.memory)} of memory; this machine has {said_bytes(memory)}: choose a coarser mesh"
         )
-    if out is not None and cost.bytes > (free := _free(out)):
+    if out is not None and cost.bytes > (free := free_bytes(out)):
         raise InputError(
-            f"the run needs about {_sized(cost.bytes)} in {out}, where {_sized(free)} are free; {why}{hint}"
+            f"the run needs about {said_bytes(cost.bytes)} in {out}, where {said_bytes(free)} are free; {why}{hint}"
         )
     if scenario.model.kind == "fem" and find_spec("kvxopt") is None:
         doubts.append(
@@ -255,11 +255,11 @@ def check_store(samples: int, bytes_each: int, out: Path) -> list[str]:
         If the disk has no room for it.
     """
     size = float(samples) * bytes_each
-    if size > (free := _free(out)):
+    if size > (free := free_bytes(out)):
         raise InputError(
-            f"{samples:,} samples of {_sized(bytes_each)} are {_sized(size)}; in {out} {_sized(free)} are free: choose a smaller --n"
+            f"{samples:,} samples of {said_bytes(bytes_each)} are {said_bytes(size)}; in {out} {said_bytes(free)} are free: choose a smaller --n"
         )
-    return [f"{samples:,} samples, up to {_sized(size)} on the disk"] if size > LONG_BYTES else []
+    return [f"{samples:,} samples, up to {said_bytes(size)} on the disk"] if size > LONG_BYTES else []
 
 
 def _inside(entry: Floats, tip: Floats, grid: RegularGrid) -> float:
@@ -299,7 +299,7 @@ def _memory() -> float:
         return inf
 
 
-def _free(folder: Path) -> float:
+def free_bytes(folder: Path) -> float:
     """Return the bytes that are free where a folder is or will be; infinite where the system does not say."""
     there = next((p for p in (folder, *folder.resolve().parents) if p.exists()), Path())
     try:
@@ -312,11 +312,13 @@ def _length(mm: float) -> str:
     return f"{mm:,.0f} mm" if mm >= 1000 else f"{mm:.4g} mm"
 
 
-def _sized(count: float) -> str:
+def said_bytes(count: float) -> str:
+    """Say a number of bytes in words."""
     return f"{count / GIB:,.1f} GiB" if count >= GIB / 10 else f"{count / 2**20:,.1f} MiB"
 
 
-def _timed(seconds: float) -> str:
+def said_time(seconds: float) -> str:
+    """Say a time in words."""
     if seconds < 120:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:,.0f} h"

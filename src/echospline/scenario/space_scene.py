@@ -82,14 +82,16 @@ def open_spatial(scenario: Scenario, folder: Path, *, own: bool = True) -> Spati
 
         volume, _ = sample_volume(name.removeprefix("sample:"))
     else:
-        from echospline.io.volume_reading import read_volume  # noqa: PLC0415
+        from echospline.io.volume_reading import read_volume_and_axis  # noqa: PLC0415
 
         axis = space.depth_axis or "y"
-        volume = read_volume(folder / name, axis)
+        volume, of_file = read_volume_and_axis(folder / name, axis)
         notes.append(
-            f"depth runs along the volume's {axis} axis"
+            f"depth runs along the volume's {axis} axis, {of_file} of its file"
             + ("" if space.depth_axis else "; say --depth-axis for another")
         )
+    if space.window is None and scenario.image.window is not None:
+        space = space.model_copy(update={"window": scenario.image.window})
     volume, space, said = _windowed(volume, space)
     notes += said
     known = made is not None
@@ -177,7 +179,7 @@ def _windowed(volume: Volume, space: SpaceSection) -> tuple[Volume, SpaceSection
     if volume.voxels.dtype == np.uint8 and space.window is None:
         return volume, space, []
     low, high = space.window or (float(volume.voxels.min()), float(volume.voxels.max()))
-    if not high > low:
+    if space.window is None and not high > low:
         raise InputError(f"the volume has one value, {low:g}, everywhere; nothing would be seen")
     chosen = (
         [] if space.window else [f"values {low:g} to {high:g} are shown as black to white (space.window)"]

@@ -17,7 +17,7 @@ from echospline.io import read_needle
 from echospline.mechanics import FEMModel, GreenModel, TPSModel
 from echospline.scenario import MODELS, Scenario, build_model, is_spatial, load, open_spatial
 from echospline.scenario.space_section import SpaceSection
-from echospline.scene import Floats, field_error
+from echospline.scene import MOVED, Floats, field_error
 from echospline.study.charts import error_map
 from echospline.study.identify import Identification, Objective, grid_search, identify
 from echospline.study.spatial_fit import PictureRuns, SeenRun, fit_in_space
@@ -293,7 +293,7 @@ def _report(
     per_frame = []
     observed = seen.displacement if observed is None else observed
     for t, u, v in zip(seen.times, found.field, observed, strict=True):
-        moves = (np.hypot(*np.nan_to_num(v).T) > 0).any()
+        moves = (np.hypot(*np.nan_to_num(v).T) > MOVED).any()
         per_frame.append({"time_s": float(t), "mae_mm": field_error(u, v).mae if moves else None})
     return {
         "source": path.name,

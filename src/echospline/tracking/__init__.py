@@ -9,7 +9,7 @@ if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.tracking.carrier_phase import CarrierPhase
     from echospline.tracking.dense_flow import DenseFlow
     from echospline.tracking.region import grid_over, inside_ahead, region_ahead
-    from echospline.tracking.score import Score, score
+    from echospline.tracking.score import Score, score, truth_doubts
     from echospline.tracking.tracker import (
         FlowTracker,
         Frame,
@@ -44,5 +44,6 @@ __all__ = [
     "region_ahead",
     "score",
     "track",
+    "truth_doubts",
     "write_track",
 ]

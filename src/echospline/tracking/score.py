@@ -77,6 +77,19 @@ def score(found: Track, truth: TrackRecord) -> Score:
     )
 
 
+def truth_doubts(found: Track, truth: TrackRecord) -> list[str]:
+    """Return the doubt that a truth is that of another cine: of one that lasts another time, by more than a frame."""
+    times, known = np.asarray(found.times), np.asarray(truth.motion.times)
+    lasts, other = float(times[-1] - times[0]), float(known[-1] - known[0])
+    frame = float(np.median(np.diff(times)))
+    if abs(other - lasts) <= frame * 1.001:
+        return []
+    return [
+        f"the truth lasts {other:.4g} s and the cine {lasts:.4g} s: if it is not the displacement.npz of the run that made this cine, the "
+        "distances from it mean nothing"
+    ]
+
+
 def true_motion(truth: TrackRecord, points: Floats, times: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     """Return a record's motion at other points (n, 2) mm and times (f,) s: displacement (f, n, 2) mm, and where it has one, (f, n) of bool.
 
