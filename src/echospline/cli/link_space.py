@@ -32,7 +32,7 @@ def make_spatial_stage(
     from echospline.scenario.space_models import build_spatial_model
 
     opened = scenario_room.open_spatial(scenario, folder)
-    say(opened.notes, "note")
+    say([*opened.notes, *scenario_room.unused_doubts(opened.scenario)], "note")
     kept, space = opened.scenario, opened.scenario.space
     assert space is not None  # opened scenes have it
     insertion = space.needle.insertion()

@@ -129,7 +129,7 @@ def live(
     opened = None
     if scenario_room.is_spatial(scenario):
         opened = scenario_room.open_spatial(scenario, folder, own=False)
-        say(opened.notes, "note")
+        say([*opened.notes, *scenario_room.unused_doubts(opened.scenario)], "note")
         scene = viewer.Scene(page_room.packed_space(opened, language=language, rate=rate))
     else:
         scenario, image = scenario.opened(folder, eight_bit=True)

@@ -84,7 +84,7 @@ def recorded_in_volume(
         axis=axis_of(needle_axis),
         calibration=calibration,
     )
-    say([*opened.notes, *paths.notes], "note")
+    say([*opened.notes, *scenario_room.unused_doubts(scenario), *paths.notes], "note")
     probe = space.probe
     fields = type(probe).model_fields
     if all(getattr(probe, name) == fields[name].default for name in ("shape", "width", "depth", "pixel")):

@@ -29,7 +29,7 @@ if TYPE_CHECKING:  # the menu, loaded on demand
     from echospline.scenario.scenario import LARGEST_FILE, Scenario, describe, load, validated
     from echospline.scenario.sections import DiscSection, ExerciseSection
     from echospline.scenario.space_models import MODELS
-    from echospline.scenario.space_scale import check_space
+    from echospline.scenario.space_scale import check_space, unused_doubts
     from echospline.scenario.space_scene import SpatialScene, is_spatial, open_spatial
 else:
     on_demand(__name__)
@@ -64,5 +64,6 @@ __all__ = [
     "size_doubts",
     "spatial_scene",
     "spatial_steps",
+    "unused_doubts",
     "validated",
 ]

@@ -51,7 +51,22 @@ UNUSED: dict[str, str] = {
 
 
 def unused_doubts(scenario: Scenario) -> list[str]:
-    """Return one sentence for every value that is set for a scene in the plane and that a scene in space does not read."""
+    """Return one sentence for every value that is set for a scene in the plane and that a scene in space does not read.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        A scene in space.
+
+    Raises
+    ------
+    InputError
+        If the material is one of the plane.
+    """
+    if scenario.tissue.material != "linear":
+        raise InputError(
+            f'tissue.material = "{scenario.tissue.material}" is computed in the plane alone; expected "linear" in a scene in space'
+        )
     plain = Scenario()
     return [
         f"{key} is of scenes in the plane, and this scene in space does not read it: {remedy}"
@@ -78,10 +93,6 @@ def check_space(scenario: Scenario, volume: Volume, out: Path | None = None) -> 
         If the volume has a size that no tissue has, the material is one of the plane, or the run needs more frames, steps or disk than there are.
     """
     space = scenario.space or SpaceSection()
-    if scenario.tissue.material != "linear":
-        raise InputError(
-            f'tissue.material = "{scenario.tissue.material}" is computed in the plane alone; expected "linear" in a scene in space'
-        )
     doubts = _size_doubts(volume) + unused_doubts(scenario)
     insertion = space.needle.insertion()
     doubts += needle_doubts_in_space(insertion, volume)
