@@ -63,7 +63,7 @@ FUZZ_SECONDS := 60
 core-fuzz: setup # the C interface under random misuse, for FUZZ_SECONDS
 	$(BIN)/python core/tests/run.py --fuzz $(FUZZ_SECONDS)
 
-BROWSER := $(patsubst %,tests/test_%.py,viewer_page page_browser page_served class_view)
+BROWSER := $(patsubst %,tests/test_%.py,viewer_page page_browser page_served page_pack class_view)
 test: setup wasm
 	tests/install-system
 	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile $(BROWSER:%=--ignore=%)

@@ -7,7 +7,6 @@ import http.client
 import io
 import json
 import os
-import shutil
 import subprocess
 import threading
 import time
@@ -39,12 +38,12 @@ from echospline.viewer.class_routes import COOKIE, Classroom, Instructor, class_
 from echospline.viewer.guard import Guard
 from echospline.viewer.learning_curve import learning_curve
 from echospline.viewer.served_scene import Scene
+from node_here import NODE, STEADY
 from test_page_replay import honest
 from test_sessions import trace_of
 
 EXERCISE = page_scene.EXERCISE
 CLASS = Criterion()
-NODE = shutil.which("node")
 ANN, BEN = "a" * 64, "b" * 64
 
 
@@ -162,7 +161,7 @@ def test_tables_for_a_spreadsheet_hold_every_attempt_and_no_formula(sessions):
 def test_the_pages_reader_takes_this_answer(sessions):
     answer = json.dumps(class_answer(sessions, CLASS))
     done = subprocess.run(
-        [NODE, "--test", "--test-reporter=tap", "tests/js/page_class.test.js"],
+        [NODE, STEADY, "--test", "--test-reporter=tap", "tests/js/page_class.test.js"],
         cwd=page_scene.ROOT, env={**os.environ, "ECHOSPLINE_CLASS": answer}, capture_output=True, text=True, timeout=60,
         check=False,
     )  # fmt: skip

@@ -19,6 +19,7 @@ import pytest
 
 from echospline import _native
 from echospline._native import green, space
+from node_here import NODE, STEADY
 
 ROOT = Path(__file__).resolve().parent.parent
 CORE = ROOT / "core"
@@ -39,7 +40,6 @@ ALL = plain("echospline.h", "green.h", "space.h")  # what JavaScript has
 WASM = ROOT / "src" / "echospline" / "_native" / "echospline.wasm"
 JAVASCRIPT = WASM.with_suffix(".js").read_text(encoding="utf-8")
 CC = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
-NODE = shutil.which("node")
 
 needs_compiler = pytest.mark.skipif(CC is None, reason="no C compiler here: nothing compiles the header")
 needs_elf = pytest.mark.skipif(
@@ -276,7 +276,7 @@ def test_javascripts_structs_are_laid_out_as_the_compiler_lays_them_out(tmp_path
         f"console.log(JSON.stringify(Array.from({{length: {len(numbers)}}}, (_, i) => m.instance.exports.number(i))))"
     )
     run = subprocess.run(
-        [NODE, "--input-type=module", "-e", code], capture_output=True, text=True, check=True
+        [NODE, STEADY, "--input-type=module", "-e", code], capture_output=True, text=True, check=True
     )
     values = iter(json.loads(run.stdout))
     result = {
@@ -285,7 +285,14 @@ def test_javascripts_structs_are_laid_out_as_the_compiler_lays_them_out(tmp_path
     }
     layouts.write_text(json.dumps(result))
     done = subprocess.run(
-        [NODE, "--test", "--test-reporter=tap", "--test-name-pattern=laid out", "tests/js/core.test.js"],
+        [
+            NODE,
+            STEADY,
+            "--test",
+            "--test-reporter=tap",
+            "--test-name-pattern=laid out",
+            "tests/js/core.test.js",
+        ],
         cwd=ROOT,
         env={**os.environ, "ECHOSPLINE_WASM_LAYOUTS": str(layouts)},
         capture_output=True,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import json
 import os
-import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -14,10 +13,10 @@ import numpy as np
 import pytest
 
 from echospline import _native
+from node_here import NODE, STEADY
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENES = json.loads((ROOT / "tests" / "core" / "scenes.json").read_text(encoding="utf-8"))["scenes"]
-NODE = shutil.which("node")
 # mm; columns in single precision are rounded differently by every level, by up to a few units in the last place
 TOLERANCE = {_native.Precision.SINGLE: 2e-5, _native.Precision.DOUBLE: 1e-6}
 
@@ -93,7 +92,7 @@ def test_webassembly_agrees_with_native(tmp_path):
     path = tmp_path / "native.json"
     path.write_text(json.dumps({"results": results, "tolerance": TOLERANCE}), encoding="utf-8")
     done = subprocess.run(
-        [NODE, "--test", "--test-reporter=tap", "tests/js/core.test.js"],
+        [NODE, STEADY, "--test", "--test-reporter=tap", "tests/js/core.test.js"],
         cwd=ROOT,
         env={**os.environ, "ECHOSPLINE_NATIVE_RESULTS": str(path)},
         capture_output=True,

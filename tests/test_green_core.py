@@ -7,7 +7,6 @@ import json
 import os
 import pickle
 import re
-import shutil
 import subprocess
 import zlib
 from pathlib import Path
@@ -22,10 +21,10 @@ from echospline.mechanics import ForcedScene, ForceModel
 from echospline.mechanics.green_tables import NativeGreen, options_of
 from echospline.scene import RegularGrid
 from green_scenes import GRID, SCENES, Attached, made, session
+from node_here import NODE, STEADY
 
 ROOT = Path(__file__).resolve().parent.parent
 WASM = ROOT / "src" / "echospline" / "_native" / "echospline.wasm"
-NODE = shutil.which("node")
 FINE = RegularGrid((90, 70), (40 / 89, 30 / 69))
 PLACES = np.array([[20.0, 9.4], [20.3, 10.0], [20.6, 10.6], [20.9, 0.2]])
 POINTS = np.vstack(
@@ -227,7 +226,7 @@ def test_webassembly_runs_the_session_as_python_does(tmp_path):
         json.dumps({"scenes": results, "poses": poses, "points": POINTS.ravel().tolist(), "tolerance": 1e-5})
     )
     done = subprocess.run(
-        [NODE, "--test", "--test-reporter=tap", "tests/js/green.test.js"],
+        [NODE, STEADY, "--test", "--test-reporter=tap", "tests/js/green.test.js"],
         cwd=ROOT,
         env={**os.environ, "ECHOSPLINE_GREEN": str(given)},
         capture_output=True,

@@ -25,9 +25,9 @@ from echospline.page.codings import (
 from echospline.page.pack import MirroredPart, MirrorPart, NeighboursPart, deflated, table
 from echospline.page.packing_space import _mirrors
 from echospline.scenario import spatial_scene
+from node_here import NODE, STEADY
 from test_page_pack import changed, put
 from test_page_pack_space import opened
-from test_page_replay import NODE
 
 RNG = np.random.default_rng(5)
 SHAPES = [(3, 4, 5), (1, 1, 1), (1, 1, 9), (1, 9, 1), (9, 1, 1), (2, 17, 3), (17, 2, 2), (2, 3, 40)]
@@ -231,7 +231,7 @@ def test_a_hostile_coding_is_refused_in_one_sentence_by_both_readers(data, name,
 def in_the_page(data, folder, *names):
     (folder / "scene.pack").write_bytes(data)
     return subprocess.run(
-        [NODE, "tests/node/read_pack.mjs", str(folder / "scene.pack"), str(folder / "out"), *names],
+        [NODE, STEADY, "tests/node/read_pack.mjs", str(folder / "scene.pack"), str(folder / "out"), *names],
         cwd=page_scene.ROOT, capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
 

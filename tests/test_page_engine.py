@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 from pathlib import Path
 
@@ -16,8 +15,8 @@ from echospline.page.exercise import default_exercises_space
 from echospline.picture import Drawing, NeedleEcho
 from echospline.scenario import Scenario, build_model
 from echospline.scene import NeedlePose
+from node_here import NODE, STEADY
 
-NODE = shutil.which("node")
 WASM = page_scene.ROOT / "src" / "echospline" / "_native" / "echospline.wasm"
 HANDS = [
     [[8.0, 0.0], [8.0, 0.0], 20],
@@ -43,7 +42,7 @@ def steered(pack: Pack, model: str, folder: Path) -> tuple[np.ndarray, np.ndarra
     (folder / "scene.pack").write_bytes(pack.to_bytes())
     out = folder / "out"
     done = subprocess.run(
-        [NODE, "tests/node/run_engine.mjs", str(folder / "scene.pack"), model, json.dumps(HANDS), str(out)],
+        [NODE, STEADY, "tests/node/run_engine.mjs", str(folder / "scene.pack"), model, json.dumps(HANDS), str(out)],
         cwd=page_scene.ROOT, capture_output=True, text=True, timeout=120, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

@@ -25,10 +25,10 @@ from echospline.page.pack import deflated, inflated
 from echospline.page.replay import tissue_of
 from echospline.scenario import Scenario, build_model
 from echospline.scene import NeedlePose, RegularGrid, UltrasoundImage
+from node_here import NODE, STEADY
 
 STUB = Path(__file__).resolve().parent / "page_stub"
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-NODE = shutil.which("node")
 
 
 @pytest.fixture(scope="module")
@@ -301,7 +301,7 @@ def test_the_one_script_is_sound_javascript(tmp_path):
     path = tmp_path / "page.mjs"
     path.write_text(one_script(stub, "main.js"), encoding="utf-8")
     done = subprocess.run(
-        [NODE, "--check", str(path)], capture_output=True, text=True, timeout=60, check=False
+        [NODE, STEADY, "--check", str(path)], capture_output=True, text=True, timeout=60, check=False
     )
     assert done.returncode == 0, done.stderr
 

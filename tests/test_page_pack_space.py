@@ -24,8 +24,9 @@ from echospline.scenario import Scenario, SpatialScene
 from echospline.scenario.space_models import build_spatial_model
 from echospline.scenario.space_scene import spatial_tissue
 from echospline.scene import NeedlePose, Probe, SpatialPose, Volume, probe_plane
+from node_here import NODE, STEADY
 from test_page_pack import changed, put
-from test_page_replay import NODE, WASM
+from test_page_replay import WASM
 
 RNG = np.random.default_rng(9)
 
@@ -345,7 +346,7 @@ def test_every_metric_of_the_page_in_space_is_that_of_the_replay(pack, kind, tmp
             hand.append([begin, tip, int(rng.integers(20, 90)), held])
         hands.append([*hand, [begin, begin, 40, probe]] if rng.random() < 0.4 else hand)
     done = subprocess.run(
-        [NODE, "tests/node/record_session.mjs", str(tmp_path / "scene.pack"), kind, json.dumps(hands)],
+        [NODE, STEADY, "tests/node/record_session.mjs", str(tmp_path / "scene.pack"), kind, json.dumps(hands)],
         cwd=page_scene.ROOT, capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import sqlite3
 import subprocess
 from pathlib import Path
@@ -23,9 +22,9 @@ from echospline.picture import Drawing, NeedleEcho
 from echospline.scenario import Scenario, build_model
 from echospline.scene import NeedlePose
 from echospline.viewer import Sessions
+from node_here import NODE, STEADY
 from test_page_pack import stub
 
-NODE = shutil.which("node")
 WASM = page_scene.ROOT / "src" / "echospline" / "_native" / "echospline.wasm"
 MODELS = ["tps", "elastic", "green"]
 
@@ -83,7 +82,7 @@ def test_webassembly_gives_pythons_field_and_picture_over_a_session(small, rows,
     (tmp_path / "scene.pack").write_bytes(small.to_bytes())
     (tmp_path / "poses.f64").write_bytes(rows.astype("<f8").tobytes())
     done = subprocess.run(
-        [NODE, "tests/node/replay_pack.mjs", *(str(tmp_path / name) for name in ("scene.pack", "poses.f64")), kind, str(tmp_path / "out")],
+        [NODE, STEADY, "tests/node/replay_pack.mjs", *(str(tmp_path / name) for name in ("scene.pack", "poses.f64")), kind, str(tmp_path / "out")],
         cwd=page_scene.ROOT, env={**os.environ, "WATCHED": json.dumps(places.ravel().tolist())},
         capture_output=True, text=True, timeout=120, check=False,
     )  # fmt: skip
@@ -139,7 +138,7 @@ def test_every_metric_of_the_page_is_that_of_the_replay_to_the_printed_digits(sm
         pytest.skip("echospline.wasm is not built; run make wasm")
     (tmp_path / "scene.pack").write_bytes(small.to_bytes())
     done = subprocess.run(
-        [NODE, "tests/node/record_session.mjs", str(tmp_path / "scene.pack"), kind, json.dumps(hands(12))],
+        [NODE, STEADY, "tests/node/record_session.mjs", str(tmp_path / "scene.pack"), kind, json.dumps(hands(12))],
         cwd=page_scene.ROOT, capture_output=True, timeout=120, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr.decode()

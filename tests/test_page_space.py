@@ -19,7 +19,8 @@ from echospline.scenario import Scenario
 from echospline.scenario.space_models import build_spatial_model
 from echospline.scenario.space_scene import SpatialScene
 from echospline.scene import SpatialPose, Tissue, probe_plane
-from test_page_engine import NODE, WASM
+from node_here import NODE, STEADY
+from test_page_engine import WASM
 from test_slices import smooth_volume
 
 ALONG, ASIDE = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0], [2.0, 0.0, 1.0, 70.0, 10.0, -8.0]
@@ -118,7 +119,7 @@ def test_the_pages_engine_moves_tissue_and_draws_planes_as_the_package_does(case
     (tmp_path / "scene.pack").write_bytes(pack.to_bytes())
     out = tmp_path / "out"
     done = subprocess.run(
-        [NODE, "tests/node/run_engine.mjs", str(tmp_path / "scene.pack"), kind, json.dumps(HANDS), str(out)],
+        [NODE, STEADY, "tests/node/run_engine.mjs", str(tmp_path / "scene.pack"), kind, json.dumps(HANDS), str(out)],
         cwd=page_scene.ROOT, capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -164,7 +165,7 @@ def test_planes_of_the_page_are_those_of_the_package(tmp_path):
     }})));"""
     (tmp_path / "planes.mjs").write_text(script)
     done = subprocess.run(
-        [NODE, str(tmp_path / "planes.mjs")], capture_output=True, text=True, timeout=60, check=True
+        [NODE, STEADY, str(tmp_path / "planes.mjs")], capture_output=True, text=True, timeout=60, check=True
     )
     for k, (pose, found) in enumerate(zip(poses, json.loads(done.stdout), strict=True)):
         matrix = probe_plane(pose[:3], *pose[3:]).matrix

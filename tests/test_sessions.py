@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import json
-import shutil
 import sqlite3
 import subprocess
 import sys
@@ -19,10 +18,10 @@ from echospline.page import Exercise, parsed_sessions, score, verify
 from echospline.viewer import Record, Sessions
 from echospline.viewer.class_answers import session_file, sessions_file
 from echospline.viewer.session_schema import SCHEMA_VERSION
+from node_here import NODE, STEADY
 from test_page_replay import honest
 
 EXERCISE = page_scene.EXERCISE
-NODE = shutil.which("node")
 OLD = """CREATE TABLE session (id INTEGER PRIMARY KEY, started TEXT NOT NULL, trainee TEXT NOT NULL, exercise TEXT NOT NULL,
 definition TEXT NOT NULL, scene TEXT NOT NULL, source TEXT NOT NULL, model TEXT NOT NULL, score TEXT NOT NULL, trace BLOB NOT NULL{})"""
 COLUMNS = {
@@ -331,7 +330,7 @@ def test_the_page_hands_every_key_of_an_exercise_on_as_it_was():
         )
     ]
     done = subprocess.run(
-        [NODE, "--input-type=module", "-e", READING],
+        [NODE, STEADY, "--input-type=module", "-e", READING],
         input=json.dumps(exercises), cwd=page_scene.ROOT, capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import subprocess
 from pathlib import Path
 
@@ -17,11 +16,11 @@ from echospline.mechanics.space_response import SpaceResponse, block
 from echospline.picture import NeedleEcho
 from echospline.picture.slices import STEP, SliceDrawing
 from echospline.scene import Probe, SpatialPose, Tissue, probe_plane
+from node_here import NODE, STEADY
 from test_slices import smooth_volume
 from test_spatial_core import session
 
 ROOT = Path(__file__).resolve().parent.parent
-NODE = shutil.which("node")
 WASM = ROOT / "src" / "echospline" / "_native" / "echospline.wasm"
 
 pytestmark = [
@@ -32,7 +31,7 @@ pytestmark = [
 
 def run(test: str, **environment: str) -> None:
     done = subprocess.run(
-        [NODE, "--test", "--test-reporter=tap", f"tests/js/{test}"],
+        [NODE, STEADY, "--test", "--test-reporter=tap", f"tests/js/{test}"],
         cwd=ROOT, env={**os.environ, **environment}, capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr

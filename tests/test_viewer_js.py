@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
 
+from node_here import NODE, STEADY
+
 ROOT = Path(__file__).resolve().parent.parent
-NODE = shutil.which("node")
 
 
 @pytest.mark.skipif(
@@ -17,7 +17,7 @@ NODE = shutil.which("node")
 )
 def test_the_pages_javascript_passes_its_own_tests():
     result = subprocess.run(
-        [NODE, "--test", "--test-reporter=tap", "tests/js/"],
+        [NODE, STEADY, "--test", "--test-reporter=tap", "tests/js/"],
         cwd=ROOT,
         capture_output=True,
         text=True,
