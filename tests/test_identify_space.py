@@ -188,12 +188,13 @@ def test_landmark_models_give_back_what_the_data_determine_and_name_what_they_do
     found = fit_in_space(PictureRuns(begun, grid, opened.tissue, seen), "rmse", bootstrap=0)
     assert found.error.rmse < 1e-3
     assert found.values["sigma"] == pytest.approx(true["sigma"], rel=1e-3)
-    if where == "askew":  # contacts at several distances
-        assert found.values["alpha1"] + found.values["alpha2"] / 2 == pytest.approx(0.4, rel=0.025)
-        if kind == "tps":  # the fit for elastic stops earlier: the picture hardly tells the two apart
-            assert found.values == pytest.approx(true, rel=1e-3)
+    if where == "askew" and kind == "tps":  # contacts at several distances tell the two apart
+        assert found.values == pytest.approx(true, rel=1e-3)
         assert not found.confounded
         return
-    # friction (15) at the axis is alpha1 + alpha2 / 2: the contacts lie there
-    assert found.values["alpha1"] + found.values["alpha2"] / 2 == pytest.approx(0.4, rel=0.01)
+    # what the data determine: friction (15) at the axis where contacts lie there, a little aside of it otherwise
+    share = 0.5 if where != "askew" else 0.34
+    assert found.values["alpha1"] + share * found.values["alpha2"] == pytest.approx(
+        0.3 + share * 0.2, rel=0.01
+    )
     assert any("alpha1 and alpha2 cannot be told apart" in sentence for sentence in found.confounded)
