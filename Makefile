@@ -67,7 +67,7 @@ BROWSER := $(patsubst %,tests/test_%.py,viewer_page page_browser page_served pag
 test: setup wasm
 	tests/install-system
 	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile $(BROWSER:%=--ignore=%)
-	$(BIN)/python -m pytest $(BROWSER) # a browser's event loop stays in its process
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile $(BROWSER) # a browser's event loop stays in processes of its own
 
 format: setup
 	$(BIN)/ruff format .
