@@ -182,7 +182,7 @@ def run(
         )
         files.append("summary.png")
     scenario.save(out / "scenario.toml", folder)
-    report = {
+    found = {
         "made": datetime.now(UTC).isoformat(timespec="seconds"),
         "image": {
             "source": image.source,
@@ -209,6 +209,29 @@ def run(
         },
         "seconds": perf_counter() - began,
         "files": [*files, "scenario.toml", "run.json"],
+    }
+    return write_report(out, scenario, found)
+
+
+def write_report(out: Path, scenario: Scenario, found: dict[str, Any]) -> dict[str, Any]:
+    """Write ``run.json``: what a run found and what made it, the same for the plane and for space.
+
+    Parameters
+    ----------
+    out : Path
+        The run's folder.
+    scenario : Scenario
+        As it was resolved.
+    found : dict
+        Of this run.
+
+    Returns
+    -------
+    dict
+        The content of ``run.json``.
+    """
+    report = {
+        **found,
         "versions": {
             "python": platform.python_version(),
             "platform": platform.platform(),

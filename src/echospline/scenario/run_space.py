@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import platform
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -15,16 +13,15 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from echospline.atomic import appearing, writing
+from echospline.atomic import writing
 from echospline.errors import InputError
 from echospline.io import open_writer
 from echospline.io.displacement_space import SpatialDisplacementWriter
 from echospline.io.sequence import SequenceWriter
-from echospline.mechanics import describe_core
 from echospline.mechanics.protocol import SpatialTissueModel, State, described
 from echospline.picture.simulate_space import SpatialFrame, simulate_space
 from echospline.picture.slices import SliceFormer, lattice_of
-from echospline.scenario.run import SUFFIX, package_versions
+from echospline.scenario.run import SUFFIX, write_report
 from echospline.scenario.scenario import Scenario
 from echospline.scenario.space_scene import moduli
 from echospline.scene import RegularGrid, Volume
@@ -191,7 +188,7 @@ def run_space(
         summary_figure_space(volume, probe, tally.first, tally.shown, out / "summary.png", title=title)
         files.append("summary.png")
     scenario.save(out / "scenario.toml", folder)
-    report = {
+    found = {
         "made": datetime.now(UTC).isoformat(timespec="seconds"),
         "image": {
             "source": volume.source,
@@ -207,17 +204,8 @@ def run_space(
         "doubts": [*doubts, *tally.doubts()],
         "seconds": perf_counter() - began,
         "files": [*files, "scenario.toml", "run.json"],
-        "versions": {
-            "python": platform.python_version(),
-            "platform": platform.platform(),
-            **package_versions(),
-        },
-        "core": describe_core(),
-        "parameters": scenario.model_dump(mode="json"),
     }
-    with appearing(out / "run.json") as part:
-        part.write_text(json.dumps(report, indent=2), encoding="utf-8")
-    return report
+    return write_report(out, scenario, found)
 
 
 def moduli_of(model: object) -> str:
